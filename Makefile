@@ -16,10 +16,10 @@ help:
 	@echo "make lock    write the lock again, requirements*.txt, with the newest versions that pyproject.toml admits"
 	@echo "make demo    compare avatar methods on a capture made on the spot (OUT=$(OUT))"
 	@echo "make pictures  pictures of a demo (OUT=$(OUT)), in docs/pictures; of the page REPORT=FILE for the README"
-	@echo "make docs    build the documentation, in build/docs (NOTEBOOKS=no leaves them unexecuted)"
+	@echo "make docs    build the documentation, in build/docs"
 	@echo "make test    run the tests (in JOBS=$(JOBS) processes)"
 	@echo "make test-latest  run the tests with the newest versions instead of the lock, in $(VENV)-latest"
-	@echo "make test-commands  run all commands end to end, browsers, notebooks, the README's tables"
+	@echo "make test-commands  run all commands end to end, browsers, the README's tables"
 	@echo "make test-slow    run the tests marked slow"
 	@echo "make nightly      run what takes too long for every change: the list in .ci/run"
 	@echo "make check   style, types, architecture"
@@ -60,9 +60,9 @@ lock:
 demo: setup
 	$(BIN)/headbench demo --out $(OUT)
 
-# Warnings, broken links among them, are errors. Notebooks are executed and their output is shown on their pages.
+# Warnings, broken links among them, are errors.
 docs: setup
-	HEADBENCH_DOCS_NOTEBOOKS=$(NOTEBOOKS) $(BIN)/python -m sphinx -W --keep-going --quiet -j $(JOBS) -d build/docs-cache docs build/docs
+	$(BIN)/python -m sphinx -W --keep-going --quiet -j $(JOBS) -d build/docs-cache docs build/docs
 	@echo "The documentation is in build/docs/index.html."
 
 # The page of a demo's avatar and faults of footage on its capture, in docs/pictures, and the picture of the README, of any run's
@@ -126,7 +126,7 @@ bench: setup
 
 # The documentation's table and picture of the demo are those of the last one.
 readme: demo
-	$(BIN)/python -m headbench.reports.readme demo $(OUT) .
+	$(BIN)/python docs/_ext/stored_results.py demo $(OUT) .
 
 # The committed tree, ready to be built. An index page has no files beside it: with URL, the README's links become
 # absolute and the package names its repository.

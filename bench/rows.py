@@ -274,16 +274,6 @@ class Rows:
         labels = labels.reshape(len(methods), len(conditions))[method, condition]  # also works without rows
         return Rows(table.assign(method=pd.Series(labels, table.index, dtype="str"), condition=""))
 
-    def split(self, labels: Mapping[str, tuple[str, str]]) -> Rows:
-        """Return the rows with labels, which version 1 stored as the method, split into method and condition."""
-        table = self._table
-        parts = [labels.get(str(m), (str(m), str(c))) for m, c in zip(table["method"], table["condition"])]
-        columns = {
-            name: pd.Series([part[index] for part in parts], table.index, dtype="str")
-            for index, name in enumerate(("method", "condition"))
-        }
-        return Rows(table.assign(**columns))
-
     def in_single_precision(self) -> Rows:
         """Return the rows with values rounded to float32 (7 digits, more than tables show), which halves the file."""
         return Rows(self._table.assign(value=self._table["value"].astype(np.float32).astype(np.float64)))
@@ -495,13 +485,11 @@ def _read_table(path: Path) -> pa.Table:
     """Read the columns of `Row`; text as dictionaries, so that repeated text takes no memory."""
     with open_regular(path, ROWS) as stream:
         names = Counter(pq.read_schema(stream).names)
-        columns = [name for name in COLUMNS if name != "condition" or names[name]]  # version 1 has none
-        wrong = [f"{names[name] or 'no'} {name}" for name in columns if names[name] != 1]
+        wrong = [f"{names[name] or 'no'} {name}" for name in COLUMNS if names[name] != 1]
         if wrong:
             raise InputError(path, "columns", f"once each {', '.join(COLUMNS)}", ", ".join(wrong))
-        texts = [name for name in TEXTS if name in columns]
-        file = pq.ParquetFile(stream, read_dictionary=texts, pre_buffer=False)
-        table = file.read(columns=columns, use_threads=False, use_pandas_metadata=False)
+        file = pq.ParquetFile(stream, read_dictionary=list(TEXTS), pre_buffer=False)
+        table = file.read(columns=list(COLUMNS), use_threads=False, use_pandas_metadata=False)
         table.validate(full=True)
         return table
 

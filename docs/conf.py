@@ -1,6 +1,5 @@
 """Settings of the documentation, which `make docs` builds."""
 
-import os
 import sys
 from pathlib import Path
 
@@ -14,23 +13,15 @@ copyright = "the headbench authors, Apache-2.0"
 version = release = headbench.__version__
 
 extensions = [
-    "myst_nb",
+    "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "reference_pages",
 ]
-exclude_patterns = ["_ext", "_static", "notebooks/work-*"]
-if os.environ.get("HEADBENCH_DOCS_NOTEBOOKS") == "no":  # a build that checks the pages alone
-    nb_execution_mode = "off"
-else:
-    nb_execution_mode = "force"
-nb_execution_timeout = 120
-nb_execution_raise_on_error = True
-nb_merge_streams = True
+exclude_patterns = ["_ext", "_static"]
 
 myst_enable_extensions = ["colon_fence", "deflist", "attrs_inline"]
 myst_heading_anchors = 4
-suppress_warnings = ["mystnb.unknown_mime_type"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"

@@ -118,23 +118,6 @@ def note_of(by_method: Mapping[str, Conditions]) -> str:
     return " ".join(f"{', '.join(names)}: {note}" for note, names in methods.items())
 
 
-def titled_note(title: str, by_method: Mapping[str, Conditions]) -> str:
-    """`note_of`, naming the times by ``title``; also if every method was measured on the same several machines ("": comparable)."""
-    notes = marks({"": by_method}, ())
-    places = {each.places for each in by_method.values() if each.places}
-    texts = []
-    if len(set(notes.values())) == 1 and len(notes) == len(by_method):
-        texts.append(f"{title}: {next(iter(notes.values()))}")
-    elif notes:
-        texts.append(f"{title} of {note_of(by_method)}")
-    if len(places) == 1 and len(*places) > 1:
-        text = next(each.text for each in by_method.values() if each.places)
-        texts.append(
-            f"{title}: Measured on {text}; values of different machines or thread counts are not comparable."
-        )
-    return " ".join(texts)
-
-
 def measured_on(by_method: Mapping[str, Conditions], trivial: Sequence[str], machine: str) -> str:
     """Machines and threads of the compared methods; ``machine`` if they were not recorded."""
     compared = {method: each for method, each in by_method.items() if method not in trivial} or by_method

@@ -13,7 +13,7 @@ from ..bench.specs import MethodSpec
 from .papers import COMPARABLE, papers
 
 MEASURED = Path(__file__).with_name("measured.json")
-"""Written with the tables of the suite (`readme`)."""
+"""Written with the tables of the suite (``docs/_ext/stored_results.py``)."""
 
 
 @dataclass(frozen=True)

@@ -183,7 +183,16 @@ def protocols_command(settings: ProtocolsSettings, progress: Progress) -> Comman
     for method in settings.methods:
         if method not in runs.methods:
             raise InputError("command line", "--methods", f"some of {', '.join(runs.methods)}", method)
-    runs = runs.only(settings.methods or runs.ranked or runs.methods)
+    text, values, refused = choice_effects(runs.only(settings.methods or runs.ranked or runs.methods))
+    data = {"values": values, "refused": refused}
+    if settings.out is None:
+        return CommandResult(text, data)
+    write_text(Path(settings.out), f"{text}\n")
+    return CommandResult(settings.out, {**data, "out": settings.out})
+
+
+def choice_effects(runs: RunSet) -> tuple[str, dict[str, dict[str, float]], dict[str, str]]:
+    """Tables for `protocols_command`, the means by choice and "method task metric", and the choices that runs lack, with reasons."""
     values: dict[str, dict[str, float]] = {}
     refused: dict[str, str] = {}
     for label, protocol in choices(runs).items():
@@ -193,12 +202,7 @@ def protocols_command(settings: ProtocolsSettings, progress: Progress) -> Comman
             refused[label] = f"{error.key}: expected {error.expected}"
             continue
         values[label] = _means(own)
-    text = _text(runs.methods, values, refused)
-    data = {"values": values, "refused": refused}
-    if settings.out is None:
-        return CommandResult(text, data)
-    write_text(Path(settings.out), f"{text}\n")
-    return CommandResult(settings.out, {**data, "out": settings.out})
+    return _text(runs.methods, values, refused), values, refused
 
 
 def _means(runs: RunSet) -> dict[str, float]:

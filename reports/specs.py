@@ -1,8 +1,8 @@
-"""Specs of reports and benchmarks, without heavy imports."""
+"""Specs of reports and their commands, without heavy imports."""
 
 from __future__ import annotations
 
-from ..bench.specs import BenchmarkSpec, CommandSpec, ReportSpec
+from ..bench.specs import CommandSpec, ReportSpec
 
 TABLE = ReportSpec(
     name="table",
@@ -71,18 +71,6 @@ ROBUSTNESS = ReportSpec(
     writes=False,
 )
 
-STATISTICS = BenchmarkSpec(
-    name="statistics",
-    summary="tests and intervals on simulated comparisons: rejection rates and coverage",
-    stress="headbench.reports.statistics.calibration:stress",
-)
-
-VIEWER = BenchmarkSpec(
-    name="viewer",
-    summary="the viewer in a browser: updates per second while a slider moves, milliseconds by step",
-    speed="headbench.reports.view.benchmark:speed",
-)
-
 TABLE_COMMAND = CommandSpec(
     name="table",
     group="compare",
@@ -97,14 +85,6 @@ PROTOCOLS = CommandSpec(
     summary="Show how each choice of an evaluation changes the results: pixels, metrics, cameras, means.",
     settings="headbench.reports.protocols:ProtocolsSettings",
     function="headbench.reports.protocols:protocols_command",
-)
-
-RECOMMEND = CommandSpec(
-    name="recommend",
-    group="compare",
-    summary="Recommend a method for a budget of training time, file size and frame time, from the rows of runs.",
-    settings="headbench.reports.recommend:RecommendSettings",
-    function="headbench.reports.recommend:recommend",
 )
 
 COMPARE = CommandSpec(

@@ -9,9 +9,6 @@ from headbench.bench.registry import discover
 from headbench.methods.benchmarks import avatar, splats, training
 from headbench.methods.benchmarks.scenes import cloud
 from headbench.methods.splats import available_backends, rasterize
-from headbench.reports.statistics import calibration
-from headbench.reports.statistics.calibration import Population
-from headbench.reports.view import benchmark as viewer
 
 KERNELS = [name for name in available_backends() if name.startswith("cpu-")]
 SMALLEST = {
@@ -19,22 +16,10 @@ SMALLEST = {
     splats.tradeoffs: ({"QUICK_TRADEOFF_SIZE": (600, 48, 40)}, ["exact", "float16", "8/255", "0.05"]),
     avatar.speed: ({"QUICK_SIZES": ((700, 40, 32),)}, ["ratio", "deform", "rasterize", "700", "ga"]),
     training.speed: ({"SIZE": (40, 32), "QUICK_ROUNDS": 2}, ["ga", "ours", "gbs", "_Rasterize"]),
-    viewer.speed: (
-        {"QUICK_SPLATS": (700,), "QUICK_SECONDS": 0.1, "WINDOW": (640, 400)},
-        ["700", "images", "splats"],
-    ),
-    calibration.stress: ({"QUICK_TRIALS": 3}, [*calibration.CASES, "best by"]),
 }
 
 
-BROWSER = pytest.param(viewer.speed, marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize(
-    "measure",
-    [BROWSER if each is viewer.speed else each for each in SMALLEST],
-    ids=lambda f: f"{f.__module__}.{f.__name__}",
-)
+@pytest.mark.parametrize("measure", SMALLEST, ids=lambda f: f"{f.__module__}.{f.__name__}")
 def test_a_benchmark_has_every_row(measure, monkeypatch):
     sizes, rows = SMALLEST[measure]
     if not KERNELS and "_Rasterize" in rows:
@@ -95,28 +80,3 @@ def test_a_contribution_is_the_light_a_splat_sends():
     image = rasterize(*own[:9], background=own.background, backend="reference").image
     torch.testing.assert_close(weights, image.sum((0, 1)))
     assert weights.max() > 0
-
-
-def test_a_few_simulations_keep_the_level_of_the_test():
-    found = calibration.calibrate(Population(7, sequences=2, timesteps=60, correlation=0.9), 80)
-    assert found["verdict"] == "ok"
-    assert found["test rejects %"] <= 12
-    assert found["frame t-test rejects %"] > 50
-    few = calibration.calibrate(Population(5, sequences=1, timesteps=10), 3)
-    assert few["test rejects %"] is None
-    assert calibration.best_set_errors(3, 5, 3) == (0, 1)
-    at_margin, far_within = (calibration.equivalence_share(9, 80, mean) for mean in (calibration.MARGIN, 0.0))
-    assert at_margin <= 0.12
-    assert far_within > 0.7
-    # The test assumes symmetry: it calls too many skewed differences equivalent.
-    assert calibration.equivalence_share(9, 400, calibration.MARGIN, skewed=True) > 0.08
-
-
-@pytest.mark.slow
-def test_every_simulated_case_keeps_its_level():
-    found = calibration.stress(False, no_progress)
-    assert found.passed
-    cases = {case["simulated"]: case for case in found.data["Tests and intervals"]}
-    for name in ("7 subjects", "9 subjects", "9 subjects, 3 seeds", "20 subjects"):
-        assert 3 <= cases[name]["test rejects %"] <= 7
-        assert 93 <= cases[name]["interval covers %"] <= 97

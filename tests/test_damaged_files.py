@@ -43,7 +43,7 @@ from headbench.metrics.torch_file import read_weights
 from .datasets.head.flame_files import legacy_pickle, write_flame
 from .datasets.head.toy import toy_head
 from .datasets.monocular.videos import Recording, write_imavatar, write_insta
-from .world import procedural_capture
+from .datasets.tiny_capture import make_plan, write_tiny_capture
 
 EXAMPLES = int(os.environ.get("HEADBENCH_FUZZ_EXAMPLES", "8"))
 NUMBERS = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
@@ -144,7 +144,8 @@ def samples(tmp_path_factory):
         write(folder / kind)
     save_head(folder / "head.npz", toy_head(16))
     write_flame(folder / "flame2020.pkl", toy_head(16, shape_size=300, expression_size=10))
-    procedural_capture().copied(folder / "capture")
+    head = toy_head(16, version="procedural2020")
+    write_tiny_capture(folder / "capture", make_plan(head=head, static_offset=np.zeros_like(head.template)))
     clip = read_capture(folder / "capture")
     clip = replace(clip, poses={t: replace(pose, neck=np.zeros(3)) for t, pose in clip.poses.items()})
     video = Recording(clip, next(iter(clip.cameras)))

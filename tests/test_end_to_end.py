@@ -224,7 +224,6 @@ CASES = {
         case("protocols {demo}", "pixels: face.*"),
         case("protocols {demo} --methods ga --out p.md", "p.md", "p.md"),
     ],
-    "recommend": [case("recommend {demo} --megabytes 20", "Recommended for 20 MB: .*")],
     "report": [
         case("report {demo} --out report.html --max-mb 5", "frames with pictures", "report.html"),
         case("report plain --split", "frames with pictures", "report/index.html"),

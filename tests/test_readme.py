@@ -12,6 +12,8 @@ import yaml
 from headbench.bench.cli import main
 from headbench.bench.registry import discover
 
+from .docs_ext import stored_results
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("bench", "datasets", "methods", "metrics", "reports")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -36,14 +38,6 @@ def test_every_command_is_listed(capsys):
     assert main(["list", "commands", "--json"]) == 0
     listed = json.dumps(json.loads(capsys.readouterr().out))
     assert {name for name in offered if f'"{name}"' not in listed} == set()
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_that_pages_call_exist(page):
-    offered = set(discover("commands"))
-    blocks = re.findall(r"```bash\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    called = re.findall(r"^(?:\w+=\S+ )*headbench ([a-z]+(?: [a-z]+)?)", "\n".join(blocks), re.MULTILINE)
-    assert [name for name in called if not {name, name.split()[0]} & offered] == []
 
 
 def test_the_readme_counts_what_is_stored():
@@ -184,44 +178,27 @@ def test_ci_runs_the_test_command_of_the_readme():
     assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
-def test_tables_are_generated_from_the_stored_rows_never_typed():
-    from headbench.reports import readme
-    from headbench.reports.curve.blocks import curve_block
-
-    blocks = {
-        "demo": readme.demo_block(ROOT / readme.GALLERY),
-        readme.SUITE: readme.suite_block(ROOT),
-        readme.FURTHER: readme.further_block(ROOT / readme.GALLERY),
-        readme.ABLATIONS: readme.ablations_block(ROOT / readme.GALLERY / readme.SUITE),
-        readme.DROPS: readme.drops_block(ROOT / readme.GALLERY / readme.SUITE),
-        readme.PROTOCOLS: readme.protocols_block(ROOT / readme.GALLERY / readme.SUITE),
-        readme.RATES: readme.rates_block(readme.rate_runs(ROOT / readme.GALLERY / readme.RATES)),
-        **{
-            f"{readme.CURVES}-{over}": curve_block(readme.stored_curves(ROOT / readme.GALLERY, over), over)
-            for over in readme.CURVE_UNITS
-        },
-        **{name: block(ROOT / readme.GALLERY / name) for name, block in readme.SUBJECT_BLOCKS.items()},
-    }
-    for name, block in blocks.items():
-        begin, end = readme.marks(name)
-        page = (ROOT / readme.PAGES[name]).read_text(encoding="utf-8")
-        assert page.split(begin)[1].split(end)[0].strip() == block.strip()
+@pytest.fixture(scope="module")
+def stored():
+    return stored_results.StoredResults(ROOT)
 
 
-def test_measured_figures_are_those_of_the_stored_rows():
-    from headbench.reports import readme
+@pytest.mark.commands
+def test_blocks_of_pages_are_those_of_the_stored_rows(stored):
+    found = {name: stored_results.block_of(ROOT / page, name) for name, page in stored_results.PAGES.items()}
+    assert found == stored.blocks()
 
-    stored = json.loads((ROOT / readme.MEASURED).read_text("utf-8"))
-    assert stored == readme.measured(ROOT / readme.GALLERY / stored["suite"])
-    assert {"ours", "ga"} <= stored["methods"].keys()
+
+@pytest.mark.commands
+def test_measured_figures_are_those_of_the_stored_rows(stored):
+    written = json.loads((ROOT / "reports" / "measured.json").read_text("utf-8"))
+    assert written == stored.measured()
+    assert {"ours", "ga"} <= written["methods"].keys()
 
 
 @pytest.mark.slow
-def test_all_tables_of_the_suite_are_generated():
-    from headbench.reports import readme
-
-    folder = ROOT / readme.GALLERY / readme.SUITE
-    assert (folder / readme.RESULTS).read_text(encoding="utf-8") == readme.suite_results(folder)
+def test_all_tables_of_the_suite_are_those_of_the_stored_rows(stored):
+    assert (stored.suite / "results.md").read_text(encoding="utf-8") == stored.results()
 
 
 def test_nothing_installs_headbench_by_its_name():

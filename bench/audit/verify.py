@@ -24,7 +24,7 @@ from ..errors import ExitCode, InputError
 from ..io.images import read_png
 from ..manifest import ProtocolRecord
 from ..protocol import make_protocols
-from ..rows import ALL, FRAME
+from ..rows import ALL, FRAME, Rows
 from ..specs import CommandResult, MetricSpec
 from .evaluate import NoAvatar, images_method
 from .settings import VerifySettings
@@ -124,7 +124,7 @@ def verify(run: Path, settings: VerifySettings, progress: Progress = no_progress
         if found.mismatches:
             return found
         folder.read_rows(manifest)
-        rows = folder.rows_by_condition(manifest)
+        rows = Rows.read(folder.rows)
         rows.check_protocols(folder.rows, {task: protocol.hash for task, protocol in protocols.items()})
         images = [(images_method(m.name, m.version), Condition(m.condition)) for m in manifest.methods]
         cells = resolve_cells(config) if trained else images
@@ -197,7 +197,9 @@ def _compare(
     digits = {metric.name: metric.digits for metric in metrics}
     rows = rows[rows["metric"].isin(digits.keys())]
     if rows.duplicated(KEY).any():
-        found.differ(f"{file}, {_place([*rows[rows.duplicated(KEY)][KEY].iloc[0]])}", "one row", "several")
+        found.differ(
+            f"{file}, {_place(rows[rows.duplicated(KEY)][KEY].iloc[0].tolist())}", "one row", "several"
+        )
         return
     both = pd.concat([again.set_index(KEY)["value"], rows.set_index(KEY)["value"]], axis=1)
     for key, *values in both.dropna(how="all").itertuples(name=None):

@@ -289,11 +289,6 @@ class RunFolder:
             raise InputError(self.root, "run.json", "the folder of a run", "no run.json")
         return Manifest.read(self.manifest)
 
-    def rows_by_condition(self, manifest: Manifest) -> Rows:
-        """Read ``rows.parquet`` with methods and conditions in columns of their own."""
-        changed = {m.label: (m.name, m.condition) for m in manifest.methods if m.condition}
-        return Rows.read(self.rows).split(changed)
-
     def read_rows(self, manifest: Manifest) -> Rows:
         """Read ``rows.parquet`` with the label of method and condition as the method, see `Rows.labelled`.
 

@@ -11,7 +11,7 @@ from ..executors.options import ExecutionOptions
 from ..listing import presets_of_methods
 
 SEED = 39_000
-"""Seed of the suite's captures. Methods are tuned on captures with seeds below 10,000 (`docs/explanation/statistics.md`)."""
+"""Seed of the suite's captures. Methods are tuned on captures with seeds below 10,000 (`docs/explanation/suite.md`)."""
 
 ALL, NONE = "all", "none"
 

@@ -171,15 +171,12 @@ def read_text(path: Path, what: str) -> str:
     """
     article = f"a {what} file"
     content = read_bytes(path, article)
-    refuse_utf16(content, path, f"{article} in UTF-8")
-    with reading(path, f"{article} in UTF-8"):
-        return content.decode("utf-8-sig")
-
-
-def refuse_utf16(content: bytes, source: Source, expected: str) -> None:
-    """Raise `InputError` for text that starts as UTF-16 or UTF-32, in which some editors save files."""
+    expected = f"{article} in UTF-8"
+    # Some editors save files so.
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or b"\0" in content[:4]:
-        raise InputError(source, "", expected, "UTF-16 or UTF-32", "Save it as UTF-8.")
+        raise InputError(path, "", expected, "UTF-16 or UTF-32", "Save it as UTF-8.")
+    with reading(path, expected):
+        return content.decode("utf-8-sig")
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

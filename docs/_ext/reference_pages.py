@@ -725,21 +725,6 @@ def parseable_signature(
     return re.sub(r"<factory>|<function [\w.]+(?:<lambda>)?>", "...", signature), returns
 
 
-def complete_index(app: Any, page: str, source: list[str]) -> None:
-    """Replace the line ``*`` of an index by the pages of its folder that it does not list, if there are any."""
-    folder, _, name = page.rpartition("/")
-    if name == "index" and "\n*\n" in source[0]:
-        listed = set(source[0].splitlines())
-        others = (path.stem for path in sorted(Path(app.srcdir, folder).glob("*.md")) if path.stem != "index")
-        more = "".join(f"{stem}\n" for stem in others if stem not in listed)
-        source[0] = source[0].replace("\n*\n", f"\n{more}")
-
-
-def indexes(app: Any, env: Any, added: set[str], changed: set[str], removed: set[str]) -> list[str]:
-    """Pages to read again if pages were added or removed: the indexes, see `complete_index`."""
-    return [page for page in env.found_docs if page.endswith("/index")] if added or removed else []
-
-
 def name_outside_pages(app: Any, page: str, source: list[str]) -> None:
     """Show the path of a page that is not on the site, such as the README of the repository, in place of a link."""
     folder = Path(app.srcdir, page).parent
@@ -760,8 +745,6 @@ def setup(app: Any) -> dict[str, bool]:
         app.add_object_type(name, name, objname=title, indextemplate=f"pair: %s; {title}")
     app.connect("builder-inited", write_pages)
     app.connect("autodoc-process-signature", parseable_signature)
-    app.connect("env-get-outdated", indexes)
-    app.connect("source-read", complete_index)
     app.connect("source-read", name_outside_pages)
     app.add_role("public", public_name_role)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

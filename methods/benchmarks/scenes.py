@@ -102,7 +102,7 @@ def cloud(
 
 DIFFERENTIABLE = (
     *("means", "quats", "scales", "opacities", "colors", "viewmat", "K"),
-    *("background", "means2d_offset", "means2d_abs"),
+    *("background", "means2d_offset"),
 )
 
 
@@ -120,8 +120,8 @@ def render_with_gradients(
 
     ``weights`` (H, W) scale it per pixel.
     """
-    zeros = torch.zeros(*scene.viewmat.shape[:-2], len(scene.means), 2)
-    values = {**scene._asdict(), "means2d_offset": zeros, "means2d_abs": zeros}
+    zeros = torch.zeros(len(scene.means), 2)
+    values = {**scene._asdict(), "means2d_offset": zeros}
     leaves = {name: values[name].detach().to(dtype).clone().requires_grad_() for name in DIFFERENTIABLE}
     result = rasterize(**leaves, width=scene.width, height=scene.height, **options)
     rng = torch.Generator().manual_seed(seed)

@@ -53,7 +53,7 @@ class Passes:
         self.forward = min(self.forward, time.thread_time() - start)
         node = image.grad_fn
         image.backward(self._upstream)
-        if hasattr(node, "frames"):
+        if hasattr(node, "frame"):
             for name, seconds in cpu.stage_seconds(node).items():
                 self.stages[name] = min(self.stages.get(name, seconds), seconds)
 

@@ -53,8 +53,7 @@ def write_ga_splats(path: Path, splats: dict[str, Tensor], binding: Tensor) -> N
 def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, Tensor], Tensor]:
     """Read what GaussianAvatars or `write_ga_splats` wrote: per-splat tensors by name, and the binding.
 
-    Harmonics of degree 0 to 2 are padded with zeros. Raises `InputError` for another layout, a number of harmonics
-    that corresponds to no degree, or a triangle that the mesh does not have.
+    Harmonics of degree 0 to 2 are padded with zeros.
     """
     normals = ("nx", "ny", "nz")
     rest_names = tuple(name for name in COLUMNS if name.startswith("f_rest_"))

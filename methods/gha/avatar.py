@@ -182,11 +182,7 @@ def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -
 
 
 def read_avatar(path: Path, shared: HeadAsset, device: str) -> tuple[GaussianHead, dict[str, Tensor]]:
-    """Read what `write_avatar` wrote: the networks and their tensors, and those of the points.
-
-    Raises `InputError` if the file is damaged, or a tensor is missing, does not fit the settings, or is not finite
-    float32.
-    """
+    """Read what `write_avatar` wrote: the networks and their tensors, and those of the points."""
     (tensors, metadata), size = read_safetensors(path), code_size(shared)
     config = settings_of_text(GHAConfig, RENDERING, metadata.get(CONFIG, ""), path, CONFIG)
     head = GaussianHead.of(config, size)

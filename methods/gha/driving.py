@@ -182,7 +182,7 @@ def landmark_vertices(head: HeadAsset, neutral: FloatArray, count: int) -> IntAr
     """Vertices of the face of the (V, 3) neutral head by farthest-point sampling; all, if they are fewer.
 
     The published points are 66 detected landmarks and each hundredth vertex of the tracked face; farthest points cover
-    the same surface evenly on any head model. Raises `InputError` if the head has no face region.
+    the same surface evenly on any head model.
     """
     if "face" not in head.regions:
         known = ", ".join(sorted(head.regions)) or "no regions"

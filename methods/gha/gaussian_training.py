@@ -139,10 +139,7 @@ class GaussianTraining(OptimiserState):
 def first_points(
     scene: TrainingScene, config: GHAConfig, mesh_head: MeshHead, mesh: Weights
 ) -> dict[str, Tensor]:
-    """Gaussians on the neutral surface of the mesh phase, with its features, and some inside the mouth.
-
-    Raises `InputError` if the mesh phase ended without a surface.
-    """
+    """Gaussians on the neutral surface of the mesh phase, with its features, and some inside the mouth."""
     device = scene.device
     grid = grid_about(scene.rest, config, device, finer=2 if config.subdivide else 1)
     surface: NeutralSurface = mesh_head.surface(mesh, grid)

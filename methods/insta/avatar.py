@@ -164,10 +164,7 @@ def write_field(path: Path, parameters: Mapping[str, Tensor], occupied: np.ndarr
 def read_field(
     path: Path, architecture: Architecture, size: tuple[int, ...], device: str
 ) -> tuple[dict[str, Tensor], np.ndarray]:
-    """Read what `write_field` wrote: float32 parameters, and flat indices of occupied cells.
-
-    Raises `InputError` for an array that is missing, not finite or of another shape or type.
-    """
+    """Read what `write_field` wrote: float32 parameters, and flat indices of occupied cells."""
     shapes = architecture.shapes()
     cells = math.prod(size)
     members = {name: Member("f", shape, dtype="f2") for name, shape in shapes.items()}

@@ -172,10 +172,7 @@ def _words(command: str) -> list[str]:
 def _answer(
     command: Sequence[str], source: str, kind: str, errors: int = subprocess.STDOUT, remedy: str = ""
 ) -> tuple[str, str]:
-    """Output of a command run for at most `PROBE_S` and, if ``errors`` separates it, its stderr.
-
-    Raises `InputError` if it does not end, or cannot be started; then ``kind`` says what was expected.
-    """
+    """Output of a command run for at most `PROBE_S` and, if ``errors`` separates it, its stderr."""
     try:
         done = subprocess.run(
             command,
@@ -202,8 +199,7 @@ def inspect_checkout(
 ) -> Checkout:
     """Check the settings of a method: folder, commit, interpreter or program, importable modules, and GPU.
 
-    ``environment`` checks what runs the code; None uses `inspect_interpreter`. Raises `InputError` with the setting
-    and the next step for the first failed check.
+    ``environment`` checks what runs the code; None uses `inspect_interpreter`.
     """
     folder, record = inspect_folder(method, config, repository)
     python, versions = environment() if environment else inspect_interpreter(method, config, repository)
@@ -252,21 +248,19 @@ def _commit(folder: Path) -> tuple[str, dict[str, Any]]:
     if not top or Path(top).resolve() != folder:
         return "", {}
     commit = _git(folder, "rev-parse", "HEAD").strip()
-    compare = ("diff", "--no-ext-diff", "--no-textconv", "--ignore-submodules")
-    difference = _git(folder, *compare, "HEAD")
+    difference = _git(folder, "diff", "--ignore-submodules", "HEAD")
     if not difference:
         return commit, {"changed": []}
-    names = _git(folder, *compare, "--name-only", "HEAD").split("\n")
-    changed = [name for name in names if name][:40]
-    return commit, {"changed": changed, "difference": hashlib.sha256(difference.encode()).hexdigest()}
+    changed = _git(folder, "diff", "--ignore-submodules", "--name-only", "HEAD").split("\n")
+    digest = hashlib.sha256(difference.encode()).hexdigest()
+    return commit, {"changed": [name for name in changed if name][:40], "difference": digest}
 
 
 def _git(folder: Path, *arguments: str) -> str:
-    """Output of git, "" if it fails. Hooks and programs named in the checkout's configuration are not run."""
-    safe = ("-c", "core.fsmonitor=false", "-c", "core.hooksPath=/dev/null", "-c", f"safe.directory={folder}")
+    """Output of git, "" if it fails."""
     try:
         done = subprocess.run(
-            ["git", "-C", str(folder), *safe, *arguments],
+            ["git", "-C", str(folder), "-c", f"safe.directory={folder}", *arguments],
             check=False,
             capture_output=True,
             stdin=subprocess.DEVNULL,

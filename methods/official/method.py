@@ -12,7 +12,7 @@ from typing import IO, Any, ClassVar, Generic, Literal, TypeVar
 from ...bench.contracts import Budget, Camera, Clip, Frame, FrameKey, HeadAsset, HeadPose, Progress
 from ...bench.errors import InputError, UnavailableError
 from ...bench.io.documents import read_json
-from ...bench.io.files import digest_file, write_json
+from ...bench.io.files import write_json
 from ...bench.process import ProgramEnd, described, run_program
 from ..shared.avatar_files import (
     HEAD_FILE,
@@ -37,9 +37,7 @@ from .workplace import (
     Patch,
     Workplace,
     alone,
-    as_recorded,
     check_export,
-    exported_files,
     remove,
     write_launcher,
 )
@@ -243,8 +241,7 @@ class OfficialMethod(ABC, Generic[Config]):
         """Export the training frames, run the authors' training on them, and keep what rendering needs.
 
         After a kill the training restarts on the existing export, since the repositories' checkpoints do not allow an
-        exact continuation. Raises `InputError` before any work for what `check` refuses and for a budget in seconds,
-        and `ProgramError` if the program fails.
+        exact continuation.
         """
         run = run_digest(self.name, self.version, self.config, clip, budget, seed)
         if not is_finished(out, run):
@@ -334,15 +331,14 @@ class OfficialMethod(ABC, Generic[Config]):
         def exporting(done: int, total: int, note: str = "") -> None:
             fit.progress(done, steps, note or "exporting")
 
-        if not (record.exists() and read_json(record).get("run") == fit.run and as_recorded(record, work)):
+        if not (record.exists() and read_json(record).get("run") == fit.run):
             for folder in (work.input, work.program, work.model):
                 remove(folder)
             record.unlink(missing_ok=True)
             work.make()
             images = self.export(fit.clip, work, exporting)
-            digests = {path: digest_file(work.root / path) for path in exported_files(work)}
             named = {path: list(key) for path, key in images.items()}
-            write_json(record, {"run": fit.run, "images": named, "files": digests})
+            write_json(record, {"run": fit.run, "images": named})
         check_export(work, {p: FrameKey(*key) for p, key in read_json(record)["images"].items()}, fit.clip)
 
 

@@ -57,7 +57,7 @@ def coverage_of(clip: Clip, key: FrameKey) -> ByteArray:
 def straight_rgba(clip: Clip, key: FrameKey) -> ByteArray:
     """(H, W, 4) straight alpha: contribution of the head to a pixel divided by its coverage, without the background.
 
-    Colours times coverage equal the frame on black within half a level. Raises `InputError` for a frame without a mask.
+    Colours times coverage equal the frame on black within half a level.
     """
     mask = coverage_of(clip, key)
     coverage = mask.astype(np.float32) / 255
@@ -101,11 +101,7 @@ def check_no_skew(camera: Camera) -> None:
 
 
 def check_one_camera(clip: Clip) -> Camera:
-    """The camera of the first training frame.
-
-    Raises `InputError` if other training frames have another image size, focal length or principal point, for code
-    that reads those of the first frame.
-    """
+    """The camera of the first training frame."""
     first = clip.cameras[clip.splits["train"][0].camera]
     for name in sorted({key.camera for key in clip.splits["train"]}):
         camera = clip.cameras[name]
@@ -245,10 +241,7 @@ def on_background(rgb: FloatArray, alpha: FloatArray, background: Sequence[float
 
 
 def read_covered(frame: Listed, path: Path, background: Sequence[float]) -> Frame:
-    """A render (RGBA) on black, on a background.
-
-    Raises `InputError` for a file of another size or without coverage.
-    """
+    """A render (RGBA) on black, on a background."""
     pixels = read_pixels(path, size=(frame.camera.width, frame.camera.height))
     if pixels.ndim != 3 or pixels.shape[2] != 4:
         raise InputError(path, str(frame.key), "colours and coverage (RGBA)", f"shape {pixels.shape}")

@@ -16,8 +16,7 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, Frame, FrameKey, HeadPose
 from ...bench.errors import InputError
-from ...bench.io.documents import read_json
-from ...bench.io.files import atomic_path, check_output_folder, digest_file, write_json
+from ...bench.io.files import atomic_path, check_output_folder, write_json
 from ...bench.io.images import probe_image, read_png
 from ...datasets.images import write_image
 from .checkout import Checkout
@@ -82,8 +81,6 @@ def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) ->
     Every image in the program's folders must be exported for a training key, each equally often, or be a placeholder of a
     single pixel, which shows no frame. `clip` gives no pixels of other frames
     (`headbench.bench.engine.guard.TrainingView`), so that none can have such a name.
-
-    Raises `InputError` for an image of another frame, one that was not exported, and a missing one.
     """
     allowed = frozenset(clip.splits["train"])
     for path, key in images.items():
@@ -92,7 +89,8 @@ def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) ->
     if len(set(Counter(images.values()).values())) > 1:
         expected, found = "as many images of each training frame", "different numbers"
         raise InputError(work.root, "images", expected, found)
-    there = {path for path in exported_files(work) if Path(path).suffix.lower() in _IMAGES}
+    files = (path for folder in (work.input, work.program) for path in folder.rglob("*"))
+    there = {path.relative_to(work.root).as_posix() for path in files if path.suffix.lower() in _IMAGES}
     there -= {path for path in there - images.keys() if _is_placeholder(work.root / path)}
     for what, names in (
         ("an exported image", images.keys() - there),
@@ -110,8 +108,6 @@ def write_placeholder(path: Path) -> None:
 
 
 def _is_placeholder(path: Path) -> bool:
-    if path.suffix != ".png" or path.is_symlink():
-        return False
     info = probe_image(path)
     return (info.width, info.height) == (1, 1)
 
@@ -120,27 +116,9 @@ _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".
 LOCK = "program.lock"
 
 
-def exported_files(work: Workplace) -> list[str]:
-    """Files of the program's input and working directory, by path."""
-    folders = (work.input, work.program)
-    found = (path for folder in folders for path in folder.rglob("*") if path.is_file() or path.is_symlink())
-    return sorted(path.relative_to(work.root).as_posix() for path in found)
-
-
-def as_recorded(record: Path, work: Workplace) -> bool:
-    """Whether all exported files exist unchanged."""
-    files = read_json(record).get("files", {})
-    return files.keys() <= set(exported_files(work)) and all(
-        digest_file(work.root / path) == known for path, known in files.items()
-    )
-
-
 @contextmanager
 def alone(folder: Path) -> Iterator[IO[str]]:
-    """Make a folder and hold its lock; a program that inherits the lock keeps it if this process is killed.
-
-    Raises `InputError` if a program of an earlier call still runs.
-    """
+    """Make a folder and hold its lock; a program that inherits the lock keeps it if this process is killed."""
     check_output_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / LOCK).open("a+") as stream:

@@ -34,11 +34,6 @@ def call(name: str, *arguments: Any) -> Any:
     """Call a function of the kernel with `arrays`. Results do not depend on the number of threads.
 
     Output arrays must be contiguous, as those of `empty_like`.
-
-    Raises
-    ------
-    ValueError
-        An array's type, shape or layout is not what the function expects.
     """
     function = getattr(KERNEL.load(), name)
     return function(arrays(*arguments), instruction_sets()[_backend.get()], threads())

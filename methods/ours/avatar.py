@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..ops.planes import ENCODING_SIZE, Bounds, Shader, shader
 from ..ops.splats import activate, to_world
 from ..shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
 from ..shared.rendering import USUAL, Cutoffs, LastPose, PlacedSplats, StoredSplatAvatar
-from ..shared.subject_mesh import KnownPoses, SubjectMesh
+from ..shared.subject_mesh import SubjectMesh
 from .appearance import driving_coefficients
 from .field import (
     FIRST_LAYER,
@@ -82,15 +82,11 @@ class OursAvatar(StoredSplatAvatar):
         if "lines" in tensors:
             self.line_offsets = LineOffsets(tensors, positions)
             self._expressions = len(tensors["lines"]) - len(self._jaw_bases)
-        self._known = KnownPoses(self._posed, 0)
         super().__init__(stored, LastPose(self._placed), device, cutoffs)
 
     @classmethod
     def read(cls, folder: Path, device: str, *, exact: bool = False) -> OursAvatar:
-        """Read an avatar from its folder; ``exact`` reads the files of a training even if there is a coded one.
-
-        Raises `InputError` for damaged or incompatible files.
-        """
+        """Read an avatar from its folder; ``exact`` reads the files of a training even if there is a coded one."""
         head = read_shared_head(folder)
         compact = folder / COMPACT_FILE
         if compact.exists() and not exact:
@@ -101,15 +97,6 @@ class OursAvatar(StoredSplatAvatar):
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         field = read_field(folder / FIELD_FILE, head, device)
         return cls([folder / FIELD_FILE, folder / SUBJECT_FILE], mesh, subject, field, device)
-
-    def prepare(self, poses: Iterable[HeadPose], megabytes: float = 512.0) -> int:
-        """Compute meshes, triangle frames, jaw weights and offsets of known poses beforehand, within a memory limit.
-
-        Frames of these poses are then rendered faster and bit-identical. It is not done by default, so measured frame times
-        include these computations. Returns the number of poses within the limit; earlier results are discarded.
-        """
-        self._known = KnownPoses(self._posed, int(megabytes * 2**20))
-        return self._known.prepare(poses)
 
     @torch.no_grad()
     def static_logits(self) -> Tensor:
@@ -131,7 +118,7 @@ class OursAvatar(StoredSplatAvatar):
         return DrivenPose(frames, self._canonical.turns(frames), offsets)
 
     def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
-        posed = self._known(pose)
+        posed = self._posed(pose)
         end_stage("drive")
         splats = self._changed(posed)
         shape = splats.log_scales, splats.quats

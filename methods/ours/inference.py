@@ -1,7 +1,6 @@
 """Per-frame computation of a stored avatar of "ours", with precomputed values that do not depend on the frame.
 
-`tests/methods/ours/test_formula.py` compares it with the definition in float64. docs/explanation/methods/ours.md lists optimisations that
-were measured and not adopted.
+`tests/methods/ours/test_formula.py` compares it with the definition in float64.
 """
 
 from __future__ import annotations
@@ -18,19 +17,13 @@ from .field import blend_lines, line_table, normalised_weight, offset_layers
 
 
 class DrivenPose(NamedTuple):
-    """Results for a pose that are cached for known poses."""
+    """What a pose determines, for any camera."""
 
     frames: TriangleFrames
     turns: Tensor
     """(F, 3, 3) world directions to canonical ones."""
     offsets: Tensor | None
     """(N, D) of the lines; None without lines."""
-
-    @property
-    def bytes(self) -> int:
-        """Memory it takes."""
-        tensors = (*self.frames, self.turns, *(() if self.offsets is None else (self.offsets,)))
-        return sum(value.nbytes for value in tensors)
 
 
 class LineOffsets:

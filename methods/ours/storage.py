@@ -81,10 +81,7 @@ def read_field(path: Path, head: HeadAsset, device: str) -> StoredField:
 
 
 def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: HeadAsset) -> StoredField:
-    """Build a field from untrusted tensors and the comma-separated attributes that the lines change.
-
-    Raises `InputError` if a tensor is missing, is not finite float32 or does not fit the others.
-    """
+    """Build a field from untrusted tensors and the comma-separated attributes that the lines change."""
     given = names.split(",")
     if len(set(given)) != len(given) or not set(given) <= set(WIDTHS):
         raise InputError(path, DYNAMIC, f"names among {', '.join(WIDTHS)}, each once", repr(names)[:80])

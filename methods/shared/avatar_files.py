@@ -114,10 +114,7 @@ def read_stored(
     read_exact: Callable[[Path, HeadArrays], Content],
     read_coded: Callable[[Path, HeadArrays], tuple[Subject, Content]],
 ) -> ReadAvatar[Content]:
-    """Read the coded file of a folder if there is one, else the file ``name`` and the subject written by training.
-
-    Raises `InputError` for damaged or incompatible files.
-    """
+    """Read the coded file of a folder if there is one, else the file ``name`` and the subject written by training."""
     head, coded = read_shared_head(folder), folder / COMPACT_FILE
     if coded.exists():
         return ReadAvatar([coded], head, *read_coded(coded, head))
@@ -134,10 +131,7 @@ def settings_text(config: Any, names: Sequence[str], optional: Sequence[str] = (
 def settings_of_text(
     kind: type[Content], names: Sequence[str], text: str, path: Path, key: str, optional: Sequence[str] = ()
 ) -> Content:
-    """Parse a `settings_text` into a configuration of class ``kind``; ``path`` and ``key`` locate it in errors.
-
-    Raises `InputError` for other text.
-    """
+    """Parse a `settings_text` into a configuration of class ``kind``; ``path`` and ``key`` locate it in errors."""
     values = parse_json(text, path, key)
     if {*values, *optional} != {*names, *optional}:
         raise InputError(path, key, f"the settings {', '.join(names)}", repr(text)[:80])
@@ -207,10 +201,7 @@ def run_digest(method: str, version: str, config: Any, clip: Clip, budget: Budge
 
 
 def is_finished(folder: Path, run: str) -> bool:
-    """Whether this folder contains the finished avatar of this run.
-
-    Raises `InputError` if it contains the avatar of another run.
-    """
+    """Whether this folder contains the finished avatar of this run."""
     path = folder / TRAINING_FILE
     if not path.exists():
         return False

@@ -23,7 +23,7 @@ from .subject_mesh import SubjectMesh
 
 Config = TypeVar("Config")
 SPLATS_PER_PIXEL = 1.0
-"""Splats per pixel of the unrolled surface at the median pixel size; half as many lose 0.2 to 0.5 dB (docs/explanation/methods/ours.md)."""
+"""Splats per pixel of the unrolled surface at the median pixel size; half as many lose 0.2 to 0.5 dB."""
 
 
 @dataclass(frozen=True)

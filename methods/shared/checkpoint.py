@@ -45,10 +45,7 @@ def save_checkpoint(path: Path, run: str, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(path: Path, run: str, device: str) -> dict[str, Any] | None:
-    """Read the state of a run, or None without a checkpoint.
-
-    Raises `InputError` for a damaged file or one that belongs to other settings, another clip, budget or seed.
-    """
+    """Read the state of a run, or None without a checkpoint."""
     if not path.exists():
         return None
     try:

@@ -36,7 +36,7 @@ RIDGE = 0.1
 FLOOR = 0.2
 """Tracked coefficients that move the face by less than this fraction of the largest motion get less weight."""
 CONFIRMED = 2.0
-"""Standard deviations above chance from which motion is confirmed (docs/explanation/methods/ours.md has the measured values)."""
+"""Standard deviations above chance from which motion is confirmed (docs/explanation/methods/ours.md, "Planned sizes")."""
 JAW = slice(-3, None)
 """Columns of the jaw's rotation; those of the expression come before."""
 _STEP = 0.02  # radians, of the finite differences by jaw rotation

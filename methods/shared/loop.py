@@ -126,12 +126,6 @@ def train(
     cost_growth : float
         Estimated cost of a late step relative to an early one, to turn a budget in seconds into iterations; 1 for a
         constant number of splats. The estimate is repeated after the parts `ESTIMATED_AGAIN` of the seconds.
-
-    Raises
-    ------
-    InputError
-        The budget has neither iterations nor seconds, or a checkpoint is damaged or belongs to
-        another run.
     """
     budget, clock = fit.budget, fit.clock
     check_budget(budget)

@@ -41,11 +41,7 @@ class TrainedMethod(Generic[Config, Avatar]):
     def fit(
         self, clip: Clip, out: Path, budget: Budget, *, device: str, seed: int, progress: Progress
     ) -> Avatar:
-        """Train on the training split and write the avatar under ``out``; continues a killed run.
-
-        Raises `InputError` for a budget without bound, a clip without training frames, and an output folder with the
-        avatar of another run.
-        """
+        """Train on the training split and write the avatar under ``out``; continues a killed run."""
         check_budget(budget)
         check_training_split(clip)
         self.prepare(device)

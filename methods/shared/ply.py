@@ -48,8 +48,7 @@ def write_ply(path: Path, names: tuple[str, ...], table: FloatArray, comment: st
 def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
     """Read columns of a binary little-endian vertex table by name, as (N, len(names)) float32.
 
-    Other columns of any scalar type are ignored. Raises `InputError` if the file is not such a PLY, lacks a column, is
-    truncated, or has numbers that are not finite in float32. Infinite opacity logits are clamped to `LARGEST_LOGIT`.
+    Other columns of any scalar type are ignored.
     """
     content = read_bytes(path, EXPECTED)
     count, columns, start = _header(path, content)

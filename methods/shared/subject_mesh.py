@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Generic, Protocol, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -29,11 +29,6 @@ class SubjectMesh:
         (S,) identity coefficients.
     static_offset : FloatArray
         (V, 3) metres, added to the shaped template.
-
-    Raises
-    ------
-    InputError
-        The size of the mesh is not that of a head, see `check_size`.
     """
 
     def __init__(self, head: HeadAsset, shape: FloatArray, static_offset: FloatArray, device: str):
@@ -127,44 +122,6 @@ class BoundedCache(Generic[Value]):
 
 
 DRIVING = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids")
-
-
-class Sized(Protocol):
-    """A value that knows its memory size."""
-
-    @property
-    def bytes(self) -> int: ...
-
-
-SizedValue = TypeVar("SizedValue", bound=Sized)
-
-
-class KnownPoses(Generic[SizedValue]):
-    """Values by pose. The key contains all values of a pose, not its timestep."""
-
-    def __init__(self, compute: Callable[[HeadPose], SizedValue], limit: int):
-        self._compute, self._limit = compute, limit
-        self._values: dict[bytes, SizedValue] = {}
-
-    @torch.no_grad()
-    def prepare(self, poses: Iterable[HeadPose]) -> int:
-        """Compute the values of poses in order while they fit into ``limit`` bytes; returns their number."""
-        taken, count = 0, 0
-        for pose in poses:
-            key = pose_key(pose)
-            if key not in self._values:
-                value = self._compute(pose)
-                taken += value.bytes
-                if taken > self._limit:
-                    break
-                self._values[key] = value
-            count += 1
-        return count
-
-    def __call__(self, pose: HeadPose) -> SizedValue:
-        """The value of a pose, computed without caching if it is unknown."""
-        value = self._values.get(pose_key(pose)) if self._values else None
-        return self._compute(pose) if value is None else value
 
 
 def pose_key(pose: HeadPose) -> bytes:

@@ -155,11 +155,6 @@ def texel_points(uv: FloatArray, triangles: IntArray, count: int) -> SurfacePoin
         (F, 3, 2) texture coordinates of the corners.
     triangles : IntArray
         Indices of the triangles with texels.
-
-    Raises
-    ------
-    InputError
-        No triangle has an area in the chart, only slivers have, or the area is too large or too small for ``count`` texels.
     """
     a, b, c = np.moveaxis(uv[triangles], 1, 0)
     doubled = _cross(b - a, c - a)
@@ -213,10 +208,7 @@ def point_tensors(points: SurfacePoints) -> dict[str, Tensor]:
 
 
 def take_points(path: Path, tensors: dict[str, Tensor], face_count: int) -> SurfacePoints:
-    """Remove the tensors of `POINT_MEMBERS` from others and return their points.
-
-    Raises `InputError`, naming ``path``, if there are none, or for triangles that a mesh lacks.
-    """
+    """Remove the tensors of `POINT_MEMBERS` from others and return their points."""
     check_tensors(path, tensors, POINT_MEMBERS)
     triangles, barycentric = (tensors.pop(name) for name in POINT_MEMBERS)
     if not len(triangles) or not (0 <= int(triangles.min()) and int(triangles.max()) < face_count):

@@ -92,13 +92,7 @@ class HeadSurface(PointSurface):
 
 
 class ChartSurface(PointSurface):
-    """Points on the mesh of a subject with the `chart_axes` of their triangles, which turn only approximately with the head.
-
-    Raises
-    ------
-    InputError
-        The head model has no texture coordinates, or a point is on a triangle without area in the chart.
-    """
+    """Points on the mesh of a subject with the `chart_axes` of their triangles, which turn only approximately with the head."""
 
     def __init__(self, mesh: SubjectMesh, points: SurfacePoints, head: HeadAsset):
         super().__init__(mesh, points)

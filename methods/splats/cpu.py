@@ -45,24 +45,20 @@ def rasterize_cpu(request: Request, backend: str, threads: int | None) -> Render
     threads = kernel_threads() if threads is None else threads
     if not isinstance(threads, int) or threads < 1:
         raise ValueError(f"threads: expected a positive integer or None, found {threads!r}.")
-    none = request.means.new_empty(len(request.viewmats), 0, 2)
+    none = request.means.new_empty(0, 2)
     image, alpha, radii = _Rasterize.apply(
         *(request.means, request.quats, request.scales, request.opacities, request.colors),
         none if request.means2d_offset is None else request.means2d_offset,
-        none if request.means2d_abs is None else request.means2d_abs,
-        *(request.backgrounds, request.viewmats, request.Ks),
+        *(request.background, request.viewmat, request.K),
         (request.near, request.far, request.eps2d, request.antialiased)
         + (request.alpha_min, request.transmittance_min),
-        *((request.height, request.width), request.batched, available[backend], threads),
+        *((request.height, request.width), available[backend], threads),
     )
-    return request.rendering(image, alpha, lambda: radii)
+    return Rendering(image, alpha, lambda: radii)
 
 
 class _Rasterize(torch.autograd.Function):
-    """The kernel's two passes. Contiguous arrays are passed without copying.
-
-    Cameras are drawn one after the other, each with all threads; the kernel adds their gradients in that order.
-    """
+    """The kernel's two passes. Contiguous arrays are passed without copying."""
 
     @staticmethod
     def forward(
@@ -73,71 +69,53 @@ class _Rasterize(torch.autograd.Function):
         opacities: Tensor,
         colors: Tensor,
         offset: Tensor,
-        absolute: Tensor,
-        backgrounds: Tensor,
-        viewmats: Tensor,
-        Ks: Tensor,
+        background: Tensor,
+        viewmat: Tensor,
+        K: Tensor,
         settings: tuple[float, float, float, bool, float, float],
         size: tuple[int, int],
-        batched: bool,
         instruction_set: str,
         threads: int,
     ) -> tuple[Tensor, Tensor, Tensor]:
         inputs = [
-            value.contiguous() for value in (means, quats, scales, opacities, colors, offset, backgrounds)
+            value.contiguous() for value in (means, quats, scales, opacities, colors, offset, background)
         ]
-        viewmats, Ks, views = viewmats.contiguous(), Ks.contiguous(), len(viewmats)
-        images = means.new_empty(views, *size, colors.shape[-1])
-        alphas = means.new_empty(views, *size)
-        radii = torch.empty(views, len(means), dtype=torch.int32)
-        ctx.frames = [
-            KERNEL.load().forward(
-                _of_view(inputs, view),
-                (*_arrays(viewmats[view], Ks[view]), *settings),
-                _arrays(images[view], alphas[view], radii[view]),
-                instruction_set,
-                threads,
-            )
-            for view in range(views)
-        ]
-        ctx.threads, ctx.absolute_like = threads, absolute.shape
+        image, alpha = means.new_empty(*size, colors.shape[-1]), means.new_empty(*size)
+        radii = torch.empty(len(means), dtype=torch.int32)
+        ctx.frame = KERNEL.load().forward(
+            _in_order(inputs),
+            (*_arrays(viewmat.contiguous(), K.contiguous()), *settings),
+            _arrays(image, alpha, radii),
+            instruction_set,
+            threads,
+        )
+        ctx.threads = threads
         ctx.save_for_backward(*inputs)
-        # Removing the axis of a single camera here avoids a copy of the gradient in autograd.
         ctx.mark_non_differentiable(radii)
-        return (images, alphas, radii) if batched else (images[0], alphas[0], radii)
+        return image, alpha, radii
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_images: Tensor, grad_alphas: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad_image: Tensor, grad_alpha: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
-        views = len(ctx.frames)
         # The kernel adds to the gradients of drawn splats; those of others are zero.
         gradients = [torch.zeros_like(value) for value in inputs]
-        grad_viewmats, grad_Ks = inputs[0].new_zeros(views, 4, 4), inputs[0].new_zeros(views, 3, 3)
-        absolute = inputs[0].new_zeros(ctx.absolute_like) if ctx.needs_input_grad[_ABSOLUTE] else None
-        grad_images = grad_images.contiguous().view(views, *grad_images.shape[-3:])
-        grad_alphas = grad_alphas.contiguous().view(views, *grad_alphas.shape[-2:])
-        for view, frame in enumerate(ctx.frames):
-            KERNEL.load().backward(
-                frame,
-                _of_view(inputs, view),
-                _arrays(grad_images[view], grad_alphas[view]),
-                _of_view(gradients, view),
-                _arrays(grad_viewmats[view], grad_Ks[view], None if absolute is None else absolute[view]),
-                ctx.threads,
-            )
-        *of_splats, grad_backgrounds = gradients
-        return (*of_splats, absolute, grad_backgrounds, grad_viewmats, grad_Ks, None, None, None, None, None)
+        grad_viewmat, grad_K = inputs[0].new_zeros(4, 4), inputs[0].new_zeros(3, 3)
+        KERNEL.load().backward(
+            ctx.frame,
+            _in_order(inputs),
+            _arrays(grad_image.contiguous(), grad_alpha.contiguous()),
+            _in_order(gradients),
+            (*_arrays(grad_viewmat, grad_K), None),
+            ctx.threads,
+        )
+        return (*gradients, grad_viewmat, grad_K, None, None, None, None)
 
 
-_ABSOLUTE = 6  # position among the inputs
-
-
-def _of_view(tensors: Sequence[Tensor], view: int) -> tuple[Any, ...]:
-    """One camera's part of the inputs, in the kernel's order; colours may be common to all cameras, an empty offset is None."""
-    *geometry, colors, offset, background = _arrays(*tensors)
-    own = offset[view] if offset.size else None
-    return (*geometry, colors[view] if colors.ndim == 3 else colors, own, background[view])
+def _in_order(tensors: Sequence[Tensor]) -> tuple[Any, ...]:
+    """The inputs in the kernel's order; an empty offset is None."""
+    *splats, offset, background = _arrays(*tensors)
+    return (*splats, offset if offset.size else None, background)
 
 
 def peak_flops(backend: str) -> float:
@@ -146,15 +124,15 @@ def peak_flops(backend: str) -> float:
 
 
 def work(node: Any) -> tuple[int, int]:
-    """Number of splat-pixel pairs tested and drawn by the first camera of an autograd node of the kernel."""
-    return node.frames[0].work(_of_view(node.saved_tensors, 0))
+    """Number of splat-pixel pairs tested and drawn by an autograd node of the kernel."""
+    return node.frame.work(_in_order(node.saved_tensors))
 
 
 def stage_seconds(node: Any) -> dict[str, float]:
-    """Processor time of the calling thread by stage, of the first camera of an autograd node of the kernel."""
-    return node.frames[0].stage_seconds
+    """Processor time of the calling thread by stage, of an autograd node of the kernel."""
+    return node.frame.stage_seconds
 
 
-def _arrays(*tensors: Tensor | None) -> tuple[Any, ...]:
+def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
     """The tensors' memory as numpy arrays, which are passed to the kernel faster."""
-    return tuple(None if tensor is None else tensor.detach().numpy() for tensor in tensors)
+    return tuple(tensor.detach().numpy() for tensor in tensors)

@@ -2,7 +2,7 @@
 
 gsplat (Apache-2.0, https://github.com/nerfstudio-project/gsplat) is the optional extra ``cuda``.
 It is called through its functions for projection, tile lists and compositing instead of `rasterization`, so that
-offsets of the 2D means and absolute gradients are defined as here. Releases 1.5 and 1.6 are supported. Their wheels
+offsets of the 2D means are defined as here. Releases 1.5 and 1.6 are supported. Their wheels
 contain sources: the extension is compiled when gsplat is first used on a machine, which takes minutes and needs the
 CUDA toolkit. `prepare` does it before anything is timed. With ``antialiased``, 1.6 limits opacities to at least 0.5 %
 of their value, whereas other backends let them go to 0.
@@ -24,7 +24,6 @@ from types import ModuleType
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.nn.functional import pad
 
 from ...bench.errors import UnavailableError, install_extra
@@ -74,10 +73,7 @@ def _warn_once(reason: str, remedy: str) -> None:
 
 
 def prepare(device: str) -> None:
-    """Load gsplat if ``device`` is a CUDA device and it is installed; see `use_device`. Call it before timing.
-
-    Raises `UnavailableError` if gsplat's extension can be neither loaded nor compiled.
-    """
+    """Load gsplat if ``device`` is a CUDA device and it is installed; see `use_device`. Call it before timing."""
     use_device(device)
     if is_cuda(device) and installed():
         load()
@@ -85,10 +81,7 @@ def prepare(device: str) -> None:
 
 @functools.cache
 def load() -> ModuleType:
-    """Import gsplat and its extension, which is compiled when first used on a machine.
-
-    Raises `UnavailableError` if gsplat, a GPU or the CUDA toolkit is missing, or if compilation fails.
-    """
+    """Import gsplat and its extension, which is compiled when first used on a machine."""
     if not torch.cuda.is_available():
         missing = "The renderer's backend 'cuda' needs a GPU, and torch finds none."
         raise UnavailableError(missing, REMEDY)
@@ -165,7 +158,7 @@ def rasterize_cuda(request: Request) -> Rendering:
     if not supports(request):
         found = f"{request.means.dtype} on {request.means.device}"
         raise ValueError(f"means: expected torch.float32 on a CUDA device for backend 'cuda', found {found}.")
-    if request.Ks.requires_grad:
+    if request.K.requires_grad:
         raise ValueError("K: expected no gradient to be required for backend 'cuda', found that it is.")
     warn_of_clamp(str(request.means.device))
     return draw(gsplat, request)
@@ -173,15 +166,14 @@ def rasterize_cuda(request: Request) -> Rendering:
 
 def draw(gsplat: Any, request: Request) -> Rendering:
     """Render ``request`` with gsplat's functions, given as a module."""
-    views, count = len(request.viewmats), len(request.means)
     columns, rows = -(-request.width // TILE), -(-request.height // TILE)
     radii, means2d, depths, conics, compensations = gsplat.fully_fused_projection(
         request.means,
         None,
         request.quats,
         request.scales,
-        request.viewmats,
-        request.Ks,
+        request.viewmat[None],
+        request.K[None],
         request.width,
         request.height,
         eps2d=request.eps2d,
@@ -190,60 +182,36 @@ def draw(gsplat: Any, request: Request) -> Rendering:
         calc_compensations=request.antialiased,
         opacities=request.opacities,
     )
-    opacities = request.opacities.expand(views, count)
+    opacities = request.opacities[None]
     if request.antialiased:
         opacities = opacities * compensations
     if request.means2d_offset is not None:
         means2d = means2d + request.means2d_offset
-    collects = request.means2d_abs is not None and request.means2d_abs.requires_grad
-    if collects:
-        holder: list[Tensor] = []
-        means2d = _TakeAbsolute.apply(means2d, request.means2d_abs, holder)
-        holder.append(means2d)
     with torch.no_grad():
         # 1.6 skips tiles that intersect a splat's box but not its ellipse.
         known = inspect.signature(gsplat.isect_tiles).parameters
         ellipses = {"conics": conics, "opacities": opacities.contiguous()} if "conics" in known else {}
         _, keys, splats = gsplat.isect_tiles(means2d, radii, depths, TILE, columns, rows, **ellipses)
-        offsets = gsplat.isect_offset_encode(keys, views, columns, rows)
+        offsets = gsplat.isect_offset_encode(keys, 1, columns, rows)
     channels = request.colors.shape[-1]
     padding = next(number for number in CHANNELS if number >= channels) - channels
-    colors, backgrounds = request.colors, request.backgrounds
+    colors, background = request.colors, request.background
     if padding:
-        colors, backgrounds = pad(colors, (0, padding)), pad(backgrounds, (0, padding))
+        colors, background = pad(colors, (0, padding)), pad(background, (0, padding))
     images, alphas = gsplat.rasterize_to_pixels(
         means2d,
         conics,
-        colors.expand(views, count, -1),
+        colors[None],
         opacities,
         request.width,
         request.height,
         TILE,
         offsets,
         splats,
-        backgrounds=backgrounds,
-        absgrad=collects,
+        backgrounds=background[None],
     )
     # gsplat's own radii depend on opacity and are 0 for splats too faint to be drawn.
-    return request.rendering(
-        request.unstacked(images[..., :channels]),
-        request.unstacked(alphas.squeeze(-1)),
-        lambda: published_radii(request),
-    )
-
-
-class _TakeAbsolute(torch.autograd.Function):
-    """Pass the 2D means through; the gradient of a second input is the absolute gradients that gsplat stores as an attribute."""
-
-    @staticmethod
-    def forward(ctx: Any, means2d: Tensor, absolute: Tensor, holder: list[Tensor]) -> Tensor:
-        ctx.holder = holder
-        return means2d.view_as(means2d)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
-        # Cleared to break the reference cycle between the means and this function.
-        return gradient, ctx.holder.pop().absgrad, None
+    return Rendering(images[0, ..., :channels], alphas[0, ..., 0], lambda: published_radii(request))
 
 
 @functools.cache
@@ -273,9 +241,9 @@ def clamp_of(gsplat: Any, device: str) -> float:
         scales=torch.ones(1, 3, device=device),
         opacities=one,
         colors=one[None],
-        viewmats=torch.eye(4, device=device)[None],
-        Ks=torch.tensor([[[100.0, 0.0, 0.5], [0.0, 100.0, 0.5], [0.0, 0.0, 1.0]]], device=device),
-        backgrounds=torch.zeros(1, 1, device=device),
+        viewmat=torch.eye(4, device=device),
+        K=torch.tensor([[100.0, 0.0, 0.5], [0.0, 100.0, 0.5], [0.0, 0.0, 1.0]], device=device),
+        background=torch.zeros(1, device=device),
         width=1,
         height=1,
     )

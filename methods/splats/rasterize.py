@@ -29,13 +29,11 @@ def rasterize(
     alpha_min: float = ALPHA_MIN,
     transmittance_min: float = TRANSMITTANCE_MIN,
     means2d_offset: Tensor | None = None,
-    means2d_abs: Tensor | None = None,
     backend: str = "auto",
     threads: int | None = None,
     check_values: bool = True,
-    mask_non_finite: bool = False,
 ) -> Rendering:
-    """Render 3D Gaussians for one or several cameras; differentiable in every tensor.
+    """Render 3D Gaussians for a camera; differentiable in every tensor.
 
     Names, meanings and constants are gsplat's. To render depth or features, pass them as colours.
 
@@ -51,17 +49,16 @@ def rasterize(
     opacities : Tensor
         (N,) in [0, 1]. A splat below ``alpha_min`` is not drawn, so its gradient is zero.
     colors : Tensor
-        (N, C), any range, 1 <= C <= 32; or (V, N, C), a set for each of V cameras.
+        (N, C), any range, 1 <= C <= 32.
     viewmat : ArrayLike
-        (4, 4) world to camera, OpenCV axes, metres; or (V, 4, 4). With a leading V in this or in
-        ``K``, all outputs have it, and gradients of inputs that the cameras share are summed.
+        (4, 4) world to camera, OpenCV axes, metres.
     K : ArrayLike
         (3, 3) pixels; focal lengths, > 0, and principal point are used, skew is ignored. The centre
-        of the top left pixel is at (0.5, 0.5). Or (V, 3, 3).
+        of the top left pixel is at (0.5, 0.5).
     width, height : int
-        Image size, pixels, of all cameras.
+        Image size, pixels.
     background : ArrayLike | None
-        (C,) or (V, C), black if None.
+        (C,), black if None.
     near, far : float
         Splats with camera z outside this range (metres) are neither drawn nor in view.
     eps2d : float
@@ -80,14 +77,9 @@ def rasterize(
         behind it. The default, 1e-4, is gsplat's; larger values are faster and less exact. Backend
         "cuda" supports only the defaults.
     means2d_offset : Tensor | None
-        (N, 2), or (V, N, 2) with several cameras. Pixels, added to the projected means. Zeros that
+        (N, 2) pixels, added to the projected means. Zeros that
         require a gradient collect the gradient with respect to the 2D means, in pixel units like
         gsplat's; splats that are not drawn get zero.
-    means2d_abs : Tensor | None
-        Like ``means2d_offset``, but without effect on the image. If it requires a gradient, it
-        collects the sum over pixels of the absolute gradients with respect to the 2D mean, x and y
-        separately (gsplat's absgrad; Ye et al., "AbsGS", ACM MM 2024): a measure for densification,
-        not a derivative.
     backend : str
         One of `available_backends`, or "auto": for float32 the kernel on the CPU and gsplat on a GPU,
         else the reference. If float32 uses the reference, which is slow, a warning names the remedy
@@ -100,29 +92,19 @@ def rasterize(
         outside of their ranges. Training disables the check, which costs a pass over the splats and,
         on a GPU, a wait for its result. Without it a non-finite geometry is culled, a non-finite
         colour spreads to the pixels around it, and ranges are the caller's responsibility.
-    mask_non_finite : bool
-        Whether to leave out splats with a non-finite value, and count them in the result's
-        ``masked``; cameras and background are always checked.
 
     Returns
     -------
     Rendering
-        Image (H, W, C), alpha (H, W) and radii (N,), each with a leading V for several cameras.
+        Image (H, W, C), alpha (H, W) and radii (N,).
         ``radii > 0`` selects the splats in view, regardless of their opacity, which training counts,
         as in the rasteriser published with 3D Gaussian Splatting: camera z from ``near`` (0.2 m
         there) to ``far``, and at least one whole tile of 16 x 16 pixels within that many pixels of
         the mean in x and y. The radius is 3 standard deviations along the longest axis in the image,
         including the low-pass filter, rounded up. It is 0 if float32 does not resolve the splat (2^24
-        pixels and more), or if it is masked. A splat in view is not always drawn: a splat below
+        pixels and more). A splat in view is not always drawn: a splat below
         ``alpha_min`` is in view but not drawn, and the rim of an opaque one beside the image beyond 3
         standard deviations is drawn, although it is out of view.
-
-    Raises
-    ------
-    ValueError
-        An argument has a wrong type, shape, dtype, device or value; the message names it.
-    UnavailableError
-        The requested backend is not available.
     """
     request = make_request(
         *(means, quats, scales, opacities, colors, viewmat, K, width, height),
@@ -134,9 +116,7 @@ def rasterize(
         alpha_min=alpha_min,
         transmittance_min=transmittance_min,
         means2d_offset=means2d_offset,
-        means2d_abs=means2d_abs,
         check_values=check_values,
-        mask_non_finite=mask_non_finite,
     )
     if backend == "auto":
         backend = _choose(request)

@@ -9,14 +9,14 @@ recomputed in the backward pass, so memory grows with the image and the splats, 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from .constants import ALPHA_MAX, FRUSTUM_MARGIN, QUATERNION_MIN, RADIUS_MAX, TILE
-from .request import CameraInputs, Rendering, Request
+from .request import Rendering, Request
 
 CHUNK = 1024
 """Splats composited at once within a tile."""
@@ -34,23 +34,13 @@ class Footprints(NamedTuple):
 
 def rasterize_reference(request: Request) -> Rendering:
     """Render ``request``; see `rasterize` for the meaning of every field."""
-    drawn = [_draw(request, request.view(index)) for index in range(len(request.viewmats))]
-    images, alphas, radii = (torch.stack(parts) for parts in zip(*drawn, strict=True))
-    return request.rendering(request.unstacked(images), request.unstacked(alphas), lambda: radii)
-
-
-def _draw(request: Request, view: CameraInputs) -> tuple[Tensor, Tensor, Tensor]:
-    """Image, alpha and radii of one camera."""
     with torch.no_grad():
-        drawn, extents, radii = _find_drawn(request, view)
-    footprints = project(request, view, drawn)
+        drawn, extents, radii = _find_drawn(request)
+    footprints = project(request, drawn)
     order = torch.argsort(footprints.depths.detach(), stable=True)
     drawn, extents = drawn[order], extents[order]
     footprints = Footprints(*(value[order] for value in footprints))
-    colors = view.colors[drawn]
-    absolute = (
-        footprints.means.new_zeros(len(drawn), 2) if view.means2d_abs is None else view.means2d_abs[drawn]
-    )
+    colors = request.colors[drawn]
 
     rows = []
     cut_offs = request.alpha_min, request.transmittance_min
@@ -62,13 +52,11 @@ def _draw(request: Request, view: CameraInputs) -> tuple[Tensor, Tensor, Tensor]
             touching = _touching(footprints.means.detach(), extents, left, top, right, bottom)
             pixels = _pixel_centers(left, top, right, bottom).to(request.means)
             splats = Footprints(*(value[touching] for value in footprints))
-            tile = _composite_tile(
-                splats, colors[touching], absolute[touching], view.background, pixels, cut_offs
-            )
+            tile = _composite_tile(splats, colors[touching], request.background, pixels, cut_offs)
             row.append(tile.reshape(bottom - top, right - left, -1))
         rows.append(torch.cat(row, dim=1))
     image_and_alpha = torch.cat(rows, dim=0)
-    return image_and_alpha[..., :-1], image_and_alpha[..., -1], radii
+    return Rendering(image_and_alpha[..., :-1], image_and_alpha[..., -1], lambda: radii)
 
 
 @torch.no_grad()
@@ -89,13 +77,12 @@ def pixel_weights(
     before the splat. The colour of a pixel is the sum of weights times colours, plus the rest times the background.
     """
     request = Request(
-        *(means, quats, scales, opacities, means[:, :1], viewmat[None], K[None]),
-        *(means.new_zeros(1, 1), width, height),
+        *(means, quats, scales, opacities, means[:, :1], viewmat, K),
+        *(means.new_zeros(1), width, height),
         near=near,
     )
-    view = request.view(0)
-    drawn, extents, _ = _find_drawn(request, view)
-    footprints = project(request, view, drawn)
+    drawn, extents, _ = _find_drawn(request)
+    footprints = project(request, drawn)
     means, (_, xy, yy) = footprints.means, footprints.covariances.unbind(1)
     size = torch.tensor([request.width, request.height], device=means.device)
     # Pixels in the bounding box of each splat, which is extended by a pixel for rounding.
@@ -148,21 +135,21 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack(entries, dim=-1).reshape(-1, 3, 3)
 
 
-def project(request: Request, view: CameraInputs, subset: Tensor | slice) -> Footprints:
-    """Project the splats ``subset`` (indices, or a slice) of ``request`` onto the image plane of ``view``.
+def project(request: Request, subset: Tensor | slice) -> Footprints:
+    """Project the splats ``subset`` (indices, or a slice) of ``request`` onto the image plane.
 
     The covariance is factored as ``Q Qᵀ + eps2d I`` with ``Q = J W R S`` (EWA Splatting, eq. 24-31: J the
     Jacobian of the perspective division, W the camera's rotation, R S the splat's axes). By the
     Cauchy-Binet formula its determinant is a sum of squares without cancellation for needles:
     ``|q0 x q1|² + eps2d (|q0|² + |q1|²) + eps2d²``.
     """
-    rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
-    fx, fy, cx, cy = view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]
+    rotation, translation = request.viewmat[:3, :3], request.viewmat[:3, 3]
+    fx, fy, cx, cy = request.K[0, 0], request.K[1, 1], request.K[0, 2], request.K[1, 2]
 
     x, y, z = (request.means[subset] @ rotation.T + translation).unbind(-1)
     means = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
-    if view.means2d_offset is not None:
-        means = means + view.means2d_offset[subset]
+    if request.means2d_offset is not None:
+        means = means + request.means2d_offset[subset]
 
     # Far outside the image the linearisation degenerates, so slopes are clamped as in gsplat.
     margin_x = FRUSTUM_MARGIN * 0.5 * request.width / fx
@@ -185,13 +172,13 @@ def project(request: Request, view: CameraInputs, subset: Tensor | slice) -> Foo
     return Footprints(means, torch.stack([xx + eps, xy, yy + eps], dim=-1), determinants, z, opacities)
 
 
-def _find_drawn(request: Request, view: CameraInputs) -> tuple[Tensor, Tensor, Tensor]:
+def _find_drawn(request: Request) -> tuple[Tensor, Tensor, Tensor]:
     """Indices (M,) of the splats to draw, half sizes (M, 2) of their bounding boxes, and radii (N,) of all splats.
 
     Conditions are written so that NaN culls the splat.
     """
-    subset = _in_depth(request, view).nonzero().squeeze(-1)
-    footprints = project(request, view, subset)
+    subset = _in_depth(request).nonzero().squeeze(-1)
+    footprints = project(request, subset)
     radii = torch.zeros(len(request.means), dtype=torch.int32, device=request.means.device)
     radii[subset] = _published_radii(request, footprints)
 
@@ -208,21 +195,15 @@ def _find_drawn(request: Request, view: CameraInputs) -> tuple[Tensor, Tensor, T
 
 @torch.no_grad()
 def published_radii(request: Request) -> Tensor:
-    """(V, N) radii, as `Rendering.radii` defines them, of all splats of a request."""
-    radii = torch.zeros(
-        *(len(request.viewmats), len(request.means)), dtype=torch.int32, device=request.means.device
-    )
-    for index, of_view in enumerate(radii):
-        view = request.view(index)
-        # Computed for all splats, since selecting those in depth would make training wait for a GPU.
-        radii_of_all = _published_radii(request, project(request, view, slice(None)))
-        of_view.copy_(torch.where(_in_depth(request, view), radii_of_all, 0))
-    return radii
+    """(N,) radii, as `Rendering.radii` defines them, of all splats of a request."""
+    # Computed for all splats, since selecting those in depth would make training wait for a GPU.
+    radii = _published_radii(request, project(request, slice(None)))
+    return torch.where(_in_depth(request), radii, 0)
 
 
-def _in_depth(request: Request, view: CameraInputs) -> Tensor:
+def _in_depth(request: Request) -> Tensor:
     """(N,) mask of splats between the near and the far plane."""
-    depths = request.means @ view.viewmat[2, :3] + view.viewmat[2, 3]
+    depths = request.means @ request.viewmat[2, :3] + request.viewmat[2, 3]
     return (depths > request.near) & (depths < request.far)
 
 
@@ -263,14 +244,13 @@ def _pixel_centers(left: int, top: int, right: int, bottom: int) -> Tensor:
 def _composite_tile(
     splats: Footprints,
     colors: Tensor,
-    absolute: Tensor,
     background: Tensor,
     pixels: Tensor,
     cut_offs: tuple[float, float],
 ) -> Tensor:
     """Composite depth-sorted splats front to back onto ``pixels`` (P, 2); returns (P, C + 1), alpha last.
 
-    ``absolute`` (M, 2) collects the absolute gradients of the means; ``cut_offs`` are the minimum alpha and transmittance.
+    ``cut_offs`` are the minimum alpha and transmittance.
     """
     image = pixels.new_zeros(len(pixels), colors.shape[1])
     transmittance = pixels.new_ones(len(pixels))
@@ -281,7 +261,7 @@ def _composite_tile(
         image, transmittance, running = checkpoint(
             _composite_chunk,
             *(image, transmittance, running, pixels),
-            *(splats.means[part], absolute[part], splats.covariances[part], splats.determinants[part]),
+            *(splats.means[part], splats.covariances[part], splats.determinants[part]),
             *(splats.opacities[part], colors[part], cut_offs),
             use_reentrant=False,
             preserve_rng_state=False,
@@ -296,7 +276,6 @@ def _composite_chunk(
     running: Tensor,
     pixels: Tensor,
     means: Tensor,
-    absolute: Tensor,
     covariances: Tensor,
     determinants: Tensor,
     opacities: Tensor,
@@ -308,8 +287,7 @@ def _composite_chunk(
     The exponent ``dᵀ Σ⁻¹ d`` is written as the sum of squares ``Σ_yy/det (dx - Σ_xy/Σ_yy dy)² + dy²/Σ_yy``,
     which rounding cannot make negative.
     """
-    at_pixels = _CollectAbsolute.apply(means.expand(len(pixels), -1, -1), absolute)
-    dx, dy = (pixels[:, None, :] - at_pixels).unbind(-1)
+    dx, dy = (pixels[:, None, :] - means).unbind(-1)
     xy, yy = covariances[:, 1], covariances[:, 2]
     distance = yy / determinants * (dx - xy / yy * dy) ** 2 + dy * dy / yy
     alpha = (opacities * torch.exp(-0.5 * distance)).clamp(max=ALPHA_MAX)
@@ -322,15 +300,3 @@ def _composite_chunk(
     light = torch.cumprod(torch.cat([transmittance[:, None], 1 - alpha], dim=1), dim=1)
     running = torch.cat([running[:, None], drawn], dim=1)[:, -1]
     return image + (alpha * light[:, :-1]) @ colors, light[:, -1], running
-
-
-class _CollectAbsolute(torch.autograd.Function):
-    """Pass means (P, M, 2) through; the gradient of a second input (M, 2) is the sum of their absolute gradients over P."""
-
-    @staticmethod
-    def forward(ctx: Any, means: Tensor, absolute: Tensor) -> Tensor:
-        return means.view_as(means)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        return gradient, gradient.abs().sum(0)

@@ -20,7 +20,6 @@ from ...bench.manifest import ClipRecord, MethodRecord
 from ...bench.rows import ALL, Rows
 from ...bench.specs import CommandResult, MetricSpec
 from ..aggregate import subject_means
-from ..recommend import OVERRUN
 from ..runs import RunData
 from ..statistics.paired import LEAST_SUBJECTS
 from ..writers import csv_text, pipe_table
@@ -32,6 +31,9 @@ from .settings import CurveReportSettings
 TIMED = ("budget", "seconds")
 """Quantities whose axis in the plot is the measured training time."""
 LIMIT = "limit of training time"
+OVERRUN = 1.05
+"""A training with a limit of seconds counts as that limit if it took at most this many times as long, since the last
+iteration and writing the avatar come after the limit."""
 AXES = {
     "cameras": "Training cameras",
     "timesteps": "Training timesteps",
@@ -265,7 +267,7 @@ def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> No
 
 
 def _cost(point: CurvePoint, axis: str) -> float | None:
-    """Cost of a training: a measured cost, its `LIMIT` of seconds (or its seconds, if longer), or a field of the point."""
+    """Cost of a training: a measured cost, its `LIMIT` of seconds (or its seconds, beyond `OVERRUN`), or a field of the point."""
     if axis == LIMIT:
         limit, seconds = point.budget.seconds, point.cost["seconds"]
         return seconds if limit and seconds and seconds > OVERRUN * limit else limit

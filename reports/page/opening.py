@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from ...bench.specs import MetricSpec
 from ..runs import RunSet
 from .frames import Pictures, ShownFrame
-from .verdict import Values
 
 TILES = 3
 """Number of methods next to the ground truth, so that four images fill a window."""
@@ -23,7 +22,11 @@ class Opening:
 
 
 def opening(
-    runs: RunSet, best: Sequence[str], metrics: Sequence[MetricSpec], values: Values, pictures: Pictures
+    runs: RunSet,
+    best: Sequence[str],
+    metrics: Sequence[MetricSpec],
+    values: Mapping[tuple[str, str, ShownFrame], float],
+    pictures: Pictures,
 ) -> Opening:
     """Choose from the images of a page.
 

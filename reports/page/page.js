@@ -474,19 +474,6 @@ function plots() {
     parent.append(make("h3", {textContent: plot.title}), svg, make("p", {className: "note", textContent: `On the front: ${plot.front.map(i => points[i].name).join(", ")}.`}));
   });
 }
-// Which method for a budget: all answers are in the page, those on equal methods by the set of choices that fit.
-const budgetRows = [...document.querySelectorAll("#budget tbody tr")];
-function budget() {
-  const {names, costs, units, sets, sentences} = data.budget;
-  const limits = Object.keys(costs).map(cost => ({cost, limit: $(`limit-${cost}`).valueAsNumber})).filter(({limit}) => !Number.isNaN(limit));
-  const within = i => limits.every(({cost, limit}) => costs[cost][i] !== null && costs[cost][i] <= limit);
-  const fitting = names.map((_, i) => i).filter(within), key = fitting.reduce((bits, i) => bits | 1n << BigInt(i), 0n).toString(16);
-  const words = limits.map(({cost, limit}) => `${limit} ${units[cost]}`).join(" and ") || "no limit";
-  const unknown = limits.flatMap(({cost}) => names.filter((_, i) => costs[cost][i] === null).map(name => `Left out: ${name}: no measured ${cost}.`));
-  const found = fitting.length ? [`Recommended for ${words}: `, make("b", {textContent: names[fitting[0]]}), `. ${sentences[sets[key]] ?? "headbench recommend lists the choices that are not significantly worse."}`] : [`No choice is within ${words}.`];
-  $("answer").replaceChildren(...found, ...unknown.map(text => ` ${text}`));
-  budgetRows.forEach((row, i) => { row.hidden = !within(i); row.cells[1].classList.toggle("first", i === fitting[0]); });
-}
 function losses() {
   const W = Math.round($("losses").clientWidth);
   if (!W || !data.training.length) return;
@@ -686,10 +673,6 @@ if (plotted.length) {
   if (plotted.length > 1) choice($("cost-of"), "cost-of", plotted.map(task => [task, task]), costTask, value => { costTask = value; plots(); });
   plots();
 } else $("cost").hidden = true;
-if (data.budget) {
-  for (const cost in data.budget.costs) $(`limit-${cost}`).addEventListener("input", budget);
-  budget();
-}
 if (!data.training.length) $("training").hidden = true;
 $("training").addEventListener("toggle", losses);
 let width = innerWidth;

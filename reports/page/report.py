@@ -32,7 +32,6 @@ from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import COMPARISON, layouts, table_of
 from ..tables import AVATAR_TITLE, TITLES, Table
 from ..writers import render_page
-from .budget import budget_of
 from .cards import cards_of
 from .frames import Pictures, ShownFrame, choose_pictures, frame_values, worst_frames
 from .opening import Opening, opening
@@ -122,9 +121,8 @@ def page_text(
     worst = worst_frames(values, runs, metrics[0]) if metrics else []
     parts = _parts(runs)
     comparisons = _comparisons(runs)
-    words = verdict(runs, parts[0].table, metrics, comparisons["all"], values)
+    words = verdict(runs, metrics, comparisons["all"])
     cards = cards_of(runs)
-    budget = budget_of(runs, read, _marks(runs))
     content = {
         "title": words.title,
         "verdict": words,
@@ -139,7 +137,6 @@ def page_text(
         "cards": cards,
         "anchors": {card["label"]: card["anchor"] for card in cards},
         "marks": _marks(runs),
-        "budget": budget,
         "records": [record_of(run) for run in runs.runs],
         "failed": failed_cells(runs),
         "source_type": source_type(COMPOSITE),
@@ -147,7 +144,7 @@ def page_text(
         "ratio": "1000 / 1000",
         "own_style": (HERE / "page.css").read_text("utf-8"),
     }
-    data = _data(runs, metrics, values) | {"budget": budget["answers"]}
+    data = _data(runs, metrics, values)
     empty = Pictures(truth="-" * 400)
     limit = int(max_mb * MEGABYTE)
     room = limit - len(_filled(content, data, [], empty, []).encode()) - 1000

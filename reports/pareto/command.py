@@ -98,7 +98,7 @@ def _rates(
             values = [point.quality[name].get(subject, "") for name in names]
             lines.append([point.method, point.variant, subject, size, *values])
     write_text(out / "rates.csv", csv_text(lines))
-    write_rates(out / "rate_distortion.png", {task: (points, metrics)})
+    write_rates(out / "rate_distortion.png", points, metrics, task)
     return rate_differences(points, metrics, reference or methods[0])
 
 

@@ -59,37 +59,30 @@ def write_plot(
             label_points(axes, points, cost, list(itertools.chain(*fronts[cost])))
 
 
-Curves = tuple[Sequence[RatePoint], Sequence[MetricSpec]]
-
-
-def write_rates(path: Path, curves: Mapping[str, Curves]) -> None:
-    """Draw quality over megabytes for the steps of the codec: a curve for each method, a row for each task, a panel for each metric.
+def write_rates(path: Path, points: Sequence[RatePoint], metrics: Sequence[MetricSpec], task: str) -> None:
+    """Draw quality over megabytes for the steps of the codec: a curve for each method, a panel for each metric.
 
     Points are labelled with their step. Sizes are on a logarithmic axis; dashed lines are the quality of avatars as trained,
     whose size is not shown.
     """
-    names = list(dict.fromkeys(point.method for points, _ in curves.values() for point in points))
-    subjects = {subject for points, _ in curves.values() for point in points for subject in point.megabytes}
+    names = list(dict.fromkeys(point.method for point in points))
+    subjects = {subject for point in points for subject in point.megabytes}
     note = (
         f"Lines: one codec at several steps, multiplied by the number beside a point; dashed: as trained. "
         f"Means over {counted(len(subjects), 'subject')}."
     )
-    columns = max(len(metrics) for _, metrics in curves.values())
-    size = (6.2 * columns, 4.9 * len(curves))
+    size = (6.2 * len(metrics), 4.9)
     with plot_file(path, size, 200, names, note, line="-", markers=MARKERS) as (figure, looks):
-        rows = figure.subplots(len(curves), columns, squeeze=False)
-        for row, (task, (points, metrics)) in zip(rows, curves.items()):
-            for axes in row[len(metrics) :]:
-                axes.set_visible(False)
-            for axes, metric in zip(row, metrics):
-                unit = f", {metric.unit}" if metric.unit else ""
-                axes.set(xlabel="Size, MB")
-                start_axes(axes, f"{metric.label}{unit}, {TASK_TITLES.get(task, task).lower()}")
-                drawn = [_draw_rates(axes, points, metric.name, name, *look) for name, look in looks.items()]
-                if any(drawn):
-                    cost_axis(axes)
-                else:
-                    show_missing(axes, "not measured in these runs")
+        panels = figure.subplots(1, len(metrics), squeeze=False)[0]
+        for axes, metric in zip(panels, metrics):
+            unit = f", {metric.unit}" if metric.unit else ""
+            axes.set(xlabel="Size, MB")
+            start_axes(axes, f"{metric.label}{unit}, {TASK_TITLES.get(task, task).lower()}")
+            drawn = [_draw_rates(axes, points, metric.name, name, *look) for name, look in looks.items()]
+            if any(drawn):
+                cost_axis(axes)
+            else:
+                show_missing(axes, "not measured in these runs")
 
 
 def _draw_rates(

@@ -76,8 +76,8 @@ def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], lis
         for record in run.manifest.methods:
             if record.trivial or (record.condition and record.condition not in steps):
                 continue
-            sizes = by_subject(run, record.label, SIZE, "")
-            quality = {metric.name: by_subject(run, record.label, metric.name, task) for metric in metrics}
+            sizes = _by_subject(run, record.label, SIZE, "")
+            quality = {metric.name: _by_subject(run, record.label, metric.name, task) for metric in metrics}
             found.append((index, RatePoint(record.name, record.condition, sizes, quality)))
     first = {(point.method, point.variant): point for _, point in reversed(found)}
     differing = {point.method for _, point in found if point != first[point.method, point.variant]}
@@ -95,7 +95,7 @@ def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], lis
     return [point for point in points.values() if point.method in coded], metrics
 
 
-def by_subject(run: RunData, label: str, metric: str, task: str) -> dict[str, float]:
+def _by_subject(run: RunData, label: str, metric: str, task: str) -> dict[str, float]:
     """Mean of a metric by subject; subjects with missing values are left out."""
     rows = whole_images(run.rows, label, metric, task)
     bad = set(rows[rows["status"] != "ok"]["subject"])

@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, combinations
+from itertools import chain
 
 import numpy as np
 
-from ...bench.contracts import BoolArray, FloatArray
+from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.progress import counted
 from ...bench.rows import Rows
@@ -262,58 +262,6 @@ class BestSet:
     needed: int
 
 
-@dataclass(frozen=True)
-class PairwiseTests:
-    """Sign-flip tests of all pairs of methods over the same subjects, to find the best of any subset of methods.
-
-    Attributes
-    ----------
-    methods : tuple[str, ...]
-        The n methods.
-    p : FloatArray
-        (n, n) p-values, two-sided and not corrected; 1 on the diagonal.
-    better : BoolArray
-        (n, n), whether the method of the column has a better mean than that of the row.
-    subjects : int
-        Number of subjects.
-    """
-
-    methods: tuple[str, ...]
-    p: FloatArray
-    better: BoolArray
-    subjects: int
-
-    @classmethod
-    def of(cls, means: Mapping[str, Mapping[str, float]], *, higher_is_better: bool) -> PairwiseTests:
-        """Test all pairs. ``means`` maps each method (at least one) to its mean of each subject; the same subjects for all."""
-        methods = tuple(means)
-        subjects = sorted(means[methods[0]])
-        values = np.array([[means[method][subject] for subject in subjects] for method in methods])
-        values = values if higher_is_better else -values
-        p, better = np.ones((len(methods),) * 2), np.zeros((len(methods),) * 2, dtype=bool)
-        for row, column in combinations(range(len(methods)), 2):
-            differences = values[column] - values[row]
-            p[row, column] = p[column, row] = sign_flip_p(differences)
-            mean = differences.mean()
-            better[row, column], better[column, row] = mean > 0, mean < 0
-        return cls(methods, p, better, len(subjects))
-
-    def best_set(self, among: Sequence[str]) -> BestSet:
-        """The best of the methods ``among``, see `best_set`; Holm's correction is over these only."""
-        chosen = [self.methods.index(method) for method in among]
-        rivals = len(chosen) - 1
-        needed = subjects_needed(LEVEL, rivals)
-        if rivals * least_p(self.subjects) > LEVEL:
-            return BestSet(None, self.subjects, needed)
-        kept = []
-        for index in chosen:
-            others = [other for other in chosen if other != index]
-            adjusted = holm([float(self.p[index, other]) for other in others])
-            if not any(p <= LEVEL and self.better[index, other] for p, other in zip(adjusted, others)):
-                kept.append(self.methods[index])
-        return BestSet(frozenset(kept), self.subjects, needed)
-
-
 def best_set(means: Mapping[str, Mapping[str, float]], *, higher_is_better: bool) -> BestSet:
     """Find every method that does not differ significantly from the best.
 
@@ -322,4 +270,19 @@ def best_set(means: Mapping[str, Mapping[str, float]], *, higher_is_better: bool
     `LEVEL`: a confidence set of the best (J. Hsu, Multiple Comparisons, 1996, chapter 4).
     ``means`` maps each method (at least one) to its mean of each subject; the same subjects for all.
     """
-    return PairwiseTests.of(means, higher_is_better=higher_is_better).best_set(list(means))
+    subjects = sorted(next(iter(means.values())))
+    rivals = len(means) - 1
+    needed = subjects_needed(LEVEL, rivals)
+    if rivals * least_p(len(subjects)) > LEVEL:
+        return BestSet(None, len(subjects), needed)
+    sign = 1 if higher_is_better else -1
+    values = {
+        method: sign * np.array([own[subject] for subject in subjects]) for method, own in means.items()
+    }
+    kept = []
+    for method, own in values.items():
+        leads = [other - own for name, other in values.items() if name != method]
+        adjusted = holm([sign_flip_p(lead) for lead in leads])
+        if not any(p <= LEVEL and lead.mean() > 0 for p, lead in zip(adjusted, leads)):
+            kept.append(method)
+    return BestSet(frozenset(kept), len(subjects), needed)

@@ -13,7 +13,7 @@ from .paired import LEVEL
 
 PAIR = ("ours", "ga")
 PRIMARY = tuple(product(("novel_view", SEEN_CAMERAS, UNSEEN_CAMERAS), ("psnr", "lpips")))
-"""Task and metric of each endpoint; `docs/explanation/statistics.md` has the same list."""
+"""Task and metric of each endpoint; `docs/explanation/suite.md` has the same list."""
 MARGINS = {"psnr": 0.3}
 """Differences within which the methods count as equivalent, in the metric's unit."""
 

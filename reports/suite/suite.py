@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -65,7 +65,7 @@ def suite_runs(folder: Path, base: str = RUN) -> list[Path]:
     return [each for each in places if RunFolder(each).rows.is_file()]
 
 
-def suite_report(folder: Path, method: str) -> str:
+def suite_report(folder: Path, method: str, read: Callable[[Sequence[Path]], RunSet] = RunSet.read) -> str:
     """Tables of a suite as Markdown: whole frames, each region, each held-out sequence, conditions, ablations, variance.
 
     The primary endpoints are first; everything else is labelled as exploratory. Each table is followed by the paired
@@ -78,17 +78,19 @@ def suite_report(folder: Path, method: str) -> str:
         Folder of the suite.
     method : str
         Label of the reference method.
+    read : callable
+        Reads runs together.
     """
     runs, large, seeds = (suite_runs(folder, base) for base in (RUN, LARGE_RUN, SEEDS_RUN))
-    text = _tables(RunSet.read(runs), method, primary=True)
+    text = _tables(read(runs), method, primary=True)
     if section := extremes_section(read_extremes(runs)):
         text += f"\n{section}\n"
     if seeds:
         names = [run.name for run in seeds]
-        both = RunSet.read([*(run for run in runs if run.name in names), *seeds])
+        both = read([*(run for run in runs if run.name in names), *seeds])
         text += f"\n{variance_section(both.only([*both.ranked]), PAIR)}\n"
     if large:
-        text += f"\n# {LARGE}\n\n{_tables(RunSet.read(large), method, primary=False)}"
+        text += f"\n# {LARGE}\n\n{_tables(read(large), method, primary=False)}"
     return text
 
 

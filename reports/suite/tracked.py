@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from statistics import fmean
 
-from ...bench.protocol import TASK_TITLES
-from ..aggregate import subject_means, whole_images
 from ..runs import RunSet
-from ..statistics.paired import interval
 from ..table_report import Columns, table_of
 from ..tables import Column, Table, TableCell, TableRow
-from ..writers import pipe_table
 from .ablations import difference_table, meaning_of
 
 NOVEL, METRIC = "novel_view", "psnr"
@@ -61,50 +56,3 @@ def condition_table(runs: RunSet, changed: Mapping[str, str], title: str) -> Tab
     return difference_table(
         runs, pairs, names, title, meaning_of("With the condition minus without"), "methods"
     )
-
-
-def drops_by_tracking(runs: RunSet, titles: Mapping[str, str]) -> str:
-    """PSNR of novel views minus that of self-reenactment as a Markdown table, a row for each condition of tracking and task.
-
-    Means and intervals are over the subjects that all methods have under all conditions; "" if no method has a condition.
-
-    Parameters
-    ----------
-    runs : RunSet
-        Methods with and without conditions.
-    titles : mapping of str
-        Title of each condition by its name, "" for that without one.
-    """
-    labels = {
-        condition: {
-            record.name: label for label, record in runs.records.items() if record.condition == condition
-        }
-        for condition in titles
-    }
-    labels = {condition: own for condition, own in labels.items() if own}
-    methods = [name for name in labels.get("", {}) if all(name in own for own in labels.values())]
-    if not methods or len(labels) < 2:
-        return ""
-    shared = runs.only([own[name] for own in labels.values() for name in methods]).shared.by_camera
-    lines = [["drop of PSNR, dB", *(f"`{name}`" for name in methods)], ["---", *["---:"] * len(methods)]]
-    for task in (task for task in shared.tasks if task != NOVEL):
-        for condition, title in ((name, titles[name]) for name in labels):
-            row = [f"{TASK_TITLES.get(task, task)}, {title}"]
-            for name in methods:
-                means = [
-                    subject_means(found[found["status"] == "ok"])
-                    for each in (NOVEL, task)
-                    for found in [whole_images(shared.rows, labels[condition][name], METRIC, each)]
-                ]
-                values = [
-                    value - means[1][subject] for subject, value in means[0].items() if subject in means[1]
-                ]
-                if not values or len(values) < len(shared.rows.subjects):
-                    row.append("–")
-                    continue
-                bounds = interval(values)
-                text = f" ({bounds[0]:.1f}, {bounds[1]:.1f})" if bounds else ""
-                row.append(f"{fmean(values):.2f}{text}")
-            lines.append(row)
-    subjects = ", ".join(sorted(shared.rows.subjects))
-    return f"Subjects {subjects}, means and 95 % intervals:\n\n{pipe_table(lines)}"

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from math import sqrt
-from pathlib import Path
 from statistics import fmean, stdev, variance
 
 from ...bench.protocol import TASK_TITLES
 from ...bench.rows import ALL
 from ..aggregate import means_by_seed, whole_images
 from ..runs import RunSet
-from ..statistics.primary import PAIR
 from ..writers import pipe_table
 
 METRIC = "psnr"
@@ -36,7 +34,7 @@ def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
             method: means_by_seed(whole_images(runs.rows, method, METRIC, task)) for method in runs.ranked
         }
         if {*pair} <= {*values}:
-            values[f"{pair[0]} - {pair[1]}"] = _difference(values, pair)
+            values[f"{pair[0]} - {pair[1]}"] = difference_by_seed(values, pair)
         for name, by_seed in values.items():
             if found := components(by_seed):
                 subjects, mean, between, within = found
@@ -52,26 +50,7 @@ def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
     return f"## Variance between and within subjects (exploratory)\n\n{table}\n\n{how}"
 
 
-def variance_text(runs: Sequence[Path], seeds: Sequence[Path]) -> str:
-    """A sentence on the variation of the difference of `PAIR` in the ``runs`` repeated with other ``seeds``, or ""."""
-    names = [run.name for run in seeds]
-    repeated = [run for run in runs if run.name in names]
-    if not repeated:
-        return ""
-    read = RunSet.read([*repeated, *seeds]).only(PAIR).by_camera
-    values = {name: means_by_seed(whole_images(read.rows, name, METRIC, "novel_view")) for name in PAIR}
-    by_seed = _difference(values, PAIR)
-    found = components(by_seed)
-    if found is None:
-        return ""
-    subjects, mean, between, within = found
-    return (
-        f"With {len(by_seed)} training seeds on {subjects} of the subjects, the mean of `{PAIR[0]}` - `{PAIR[1]}` in novel views is {mean:+.2f} dB. "
-        f"Its standard deviation is {within:.2f} dB over the seeds of one subject, and {between:.2f} dB over subjects (means over seeds)."
-    )
-
-
-def _difference(
+def difference_by_seed(
     values: Mapping[str, Mapping[int, Mapping[str, float]]], pair: tuple[str, str]
 ) -> dict[int, dict[str, float]]:
     """First minus second of a pair by seed and subject."""

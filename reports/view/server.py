@@ -18,7 +18,7 @@ from typing import Any
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError, UnavailableError, install_extra
 from ...bench.specs import CommandResult
-from .live import with_live_signal
+from .live import LOOPBACK, with_live_signal
 from .scene import Scene, open_scene
 from .session import Session
 from .settings import ViewSettings
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> CommandResult:
     """Serve until interrupted, or for a number of seconds."""
     viser()
-    check_port(settings.host, settings.port)
+    check_port(settings.port)
     with tempfile.TemporaryDirectory(prefix="headbench-view-") as kept:
         opened = open_scene(settings, Path(kept))
         with with_live_signal(opened, settings) as scene, serving(scene, settings) as server:
@@ -49,18 +49,11 @@ def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> Co
 def serving(scene: Scene, settings: ViewSettings) -> Iterator[Any]:
     """A running server, stopped at the end of the block: its ``address`` for browsers, and its ``sessions`` by client."""
     library = viser()
-    from .guard import Guard  # needs packages that come with viser
+    from .guard import token_required  # needs packages that come with viser
 
-    guard = Guard.of(settings)
-    if guard.token:
-        log.warning(
-            "Everybody who reaches %s and has this address can look at these avatars and use this machine to draw them. "
-            "The connection is not encrypted.",
-            settings.host,
-        )
-    with redirect_stdout(io.StringIO()), guard.installed():  # viser prints a banner
-        server = library.ViserServer(host=settings.host, port=settings.port, label="headbench", verbose=False)
-    server.address = guard.address(server.get_port())
+    with redirect_stdout(io.StringIO()), token_required() as token:  # viser prints a banner
+        server = library.ViserServer(host=LOOPBACK, port=settings.port, label="headbench", verbose=False)
+    server.address = f"http://{LOOPBACK}:{server.get_port()}/{token}/"
     # Disabled: any browser could request a tunnel to a public address, which would expose images of people.
     server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
@@ -101,15 +94,13 @@ def viser() -> Any:
         ) from None
 
 
-def check_port(host: str, port: int) -> None:
-    """Raise `InputError` if the server cannot listen at an address; viser would use another port."""
+def check_port(port: int) -> None:
+    """Raise `InputError` if a port is not free; viser would use another one."""
     try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        with socket.socket(family, socket.SOCK_STREAM) as trial:
+        with socket.socket() as trial:
             trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            trial.bind((host, port))
+            trial.bind((LOOPBACK, port))
     except OSError as error:
-        expected = "an address of this machine and a port that is free"
         raise InputError(
-            "command line", "--port", expected, f"{host}:{port}: {error}", "Choose another --port."
+            "command line", "--port", "a port that is free", f"{port}: {error}", "Choose another --port."
         ) from None

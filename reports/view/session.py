@@ -53,13 +53,7 @@ TURNTABLE_VIEWS, BEYOND_DEGREES = 90, 30.0
 
 
 class Session:
-    """A browser and its view. One thread draws, with ``lock`` held, since avatars are shared.
-
-    Attributes
-    ----------
-    updates : int
-        Number of images or sets of splats sent so far.
-    """
+    """A browser and its view. One thread draws, with ``lock`` held, since avatars are shared."""
 
     def __init__(self, client: Any, scene: Scene, expressions: int, lock: threading.Lock):
         self._client, self._scene, self._lock = client, scene, lock
@@ -69,7 +63,6 @@ class Session:
         self._seen: FloatArray | None = None
         self._offset: FloatArray = np.zeros(3)
         self._tasks: list[Callable[[], None]] = []
-        self.updates = 0
         self._told = -np.inf
         self._threads = resolve(THREADS)
         self._look_at_head()
@@ -141,7 +134,6 @@ class Session:
         )
         self._client.flush()
         end = time.perf_counter()
-        self.updates += 1
         if not whole:
             self._draft = float(np.clip(scale * np.sqrt(DRAFT_S / (end - start)), LEAST_DRAFT, 0.99))
             if end - self._told < TOLD_S:
@@ -187,7 +179,6 @@ class Session:
             )
             start = packed
         self._client.flush()
-        self.updates += 1
         self._panel.show_times("; ".join(told))
 
     # -------------------------------------------------------------- the camera

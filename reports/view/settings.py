@@ -47,15 +47,8 @@ class ViewSettings(RunOptions):
     device: str = ""
     """Rendering device; by default that of the training."""
 
-    host: str = "127.0.0.1"
-    """Address to listen at. With another address than the default, everybody who can connect and has the
-    printed address, which contains a random token, can use the viewer."""
-
-    allowed_hosts: tuple[str, ...] = ()
-    """Names of this machine in browsers, such as that of a proxy, besides localhost and ``host``; others are refused."""
-
     port: int = 8080
-    """Port to listen at; 0 takes a free one."""
+    """Port of this machine to listen at; 0 takes a free one. Only browsers of this machine can connect."""
 
     seconds: float | None = None
     """Stop after this time; by default when interrupted."""

@@ -27,12 +27,12 @@ GALLERY = Path(__file__).parents[2] / "reports" / "gallery"
 @pytest.mark.parametrize(
     ("words", "encoding"),
     [
-        *((["table"], encoding) for encoding in ("ascii", "latin-1", "cp1252", "utf-8")),
-        *((words, "ascii") for words in (["table", "--format", "json"], ["compare"], ["--help"])),
+        *((["table"], encoding) for encoding in ("ascii", "cp1252", "utf-8")),
+        *((words, "ascii") for words in (["table", "--format", "json"], ["--help"])),
     ],
 )
-def test_output_is_readable_in_every_encoding(monkeypatch, words, encoding):
-    folder = [] if words == ["--help"] else [str(GALLERY)]
+def test_output_is_readable_in_every_encoding(monkeypatch, run, words, encoding):
+    folder = [] if words == ["--help"] else [str(run)]
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, io.TextIOWrapper(io.BytesIO(), encoding=encoding))
     with suppress(SystemExit):
@@ -186,9 +186,12 @@ def test_json_gives_the_numbers_of_the_table():
         (["--json"], True, False, False),
     ],
 )
-def test_a_table_is_aligned_text_on_a_terminal(capsys, monkeypatch, words, terminal, pipes, styles):
+def test_a_table_is_aligned_text_on_a_terminal(
+    capsys, monkeypatch, config, finished, words, terminal, pipes, styles
+):
+    finished(replace(config, methods=("toy_plugin:METHOD", "toy_plugin:MIRROR", "mean-image")))
     monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
-    assert cli.main(["table", str(GALLERY), *words]) == 0
+    assert cli.main(["table", config.out, *words]) == 0
     printed = capsys.readouterr().out
     assert ("|" in printed, "\x1b" in printed) == (pipes, styles)
     assert ("<ins>" in printed) == pipes
@@ -306,10 +309,8 @@ def test_a_path_that_cannot_be_used_is_code_2(arguments, tmp_path, monkeypatch, 
     ("command", "code"),
     [
         ("headbench list methods > /dev/full", 2),
-        ("headbench --help > /dev/full", 2),
         ("headbench list methods >&-", 0),
         ("headbench list methods | true; exit ${PIPESTATUS[0]}", 0),
-        ("headbench compare none --baseline none | true; exit ${PIPESTATUS[0]}", 3),
     ],
 )
 def test_output_that_goes_nowhere(command, code):

@@ -1,7 +1,7 @@
-"""The documentation, built once for all tests of it, without running its notebooks."""
+"""The generated reference as text, and the documentation as Sphinx builds it, each made once for all tests."""
 
+import importlib.util
 import io
-import os
 from pathlib import Path
 from warnings import catch_warnings, simplefilter
 
@@ -11,20 +11,21 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 @pytest.fixture(scope="session")
+def reference():
+    """Text of every generated page, by its path below ``reference/generated``."""
+    spec = importlib.util.spec_from_file_location("reference_pages", DOCS / "_ext" / "reference_pages.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.pages()
+
+
+@pytest.fixture(scope="session")
 def site(tmp_path_factory):
-    """The application of Sphinx after it has written every page, and its warnings."""
+    """The folder into which Sphinx has written every page, and its warnings."""
     application = pytest.importorskip("sphinx.application")
-    before = os.environ.get("HEADBENCH_DOCS_NOTEBOOKS")
-    os.environ["HEADBENCH_DOCS_NOTEBOOKS"] = "no"
     out, warnings = tmp_path_factory.mktemp("site"), io.StringIO()
-    try:
-        app = application.Sphinx(DOCS, DOCS, out, out / "trees", "html", status=None, warning=warnings)
-        with catch_warnings():
-            simplefilter("ignore")  # of extensions, about coming versions of Sphinx
-            app.build()
-    finally:
-        if before is None:
-            del os.environ["HEADBENCH_DOCS_NOTEBOOKS"]
-        else:
-            os.environ["HEADBENCH_DOCS_NOTEBOOKS"] = before
-    return app, warnings.getvalue()
+    app = application.Sphinx(DOCS, DOCS, out, out / "trees", "html", status=None, warning=warnings)
+    with catch_warnings():
+        simplefilter("ignore")  # of extensions, about coming versions of Sphinx
+        app.build()
+    return out, warnings.getvalue()

@@ -15,7 +15,7 @@ import pytest
 from headbench.bench import cli
 
 TUTORIALS = Path(__file__).parents[2] / "docs" / "tutorials"
-PAGES = re.search(r"(?s):maxdepth: 1\n\n(.*)\n\*\n", (TUTORIALS / "index.md").read_text("utf-8"))[1].split()
+PAGES = re.search(r"(?s):maxdepth: 1\n\n(.*?)\n```", (TUTORIALS / "index.md").read_text("utf-8"))[1].split()
 SMALLER = {
     "--cameras 6 --timesteps 24 --size 96x136": "--cameras 4 --timesteps 6 --size 48x64",
     "--preset demo": "--preset smoke",
@@ -56,6 +56,7 @@ def call(line):
     assert cli.main(words[1:]) == int(expected[1] if expected else 0), line
 
 
+@pytest.mark.commands
 @pytest.mark.parametrize("page", PAGES)
 def test_the_code_of_a_tutorial_runs(page, working):
     names = {"__name__": page}

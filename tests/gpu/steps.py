@@ -81,7 +81,7 @@ def _passes(
     """Image, and gradients of a fixed linear function of it, on the CPU."""
     scene = scene._replace(opacities=scene.opacities.clamp(max=0.98))  # whatever this gsplat clamps alpha at
     leaves = [value.detach().to(device, dtype, copy=True).requires_grad_() for value in scene[:6]]
-    leaves += [torch.zeros(len(scene.means), 2, device=device, dtype=dtype, requires_grad=True) for _ in "ab"]
+    leaves.append(torch.zeros(len(scene.means), 2, device=device, dtype=dtype, requires_grad=True))
     image = rasterize(
         *leaves[:6],
         *(scene.K, scene.width, scene.height),
@@ -89,7 +89,6 @@ def _passes(
         backend=backend,
         antialiased=antialiased,
         means2d_offset=leaves[6],
-        means2d_abs=leaves[7],
     ).image
     upstream = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
     image.backward(upstream.to(device, dtype))

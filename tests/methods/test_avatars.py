@@ -35,15 +35,15 @@ from .ours.toy import SMALL, changed
 from .rgbavatar.small import SMALL as SMALL_RGBAVATAR
 from .toy_clip import first_view
 
-FAST = SplatTraining(max_splats=1200, min_densify_every=40, min_settle=20)
+FAST = SplatTraining(max_splats=1200, min_densify_every=16, min_settle=8)
 BLENDSHAPES = BlendshapeTraining(
-    max_splats=1200, densify_from=0, densify_gradient=1e-4, min_densify_every=40, min_settle=20
+    max_splats=1200, densify_from=0, densify_gradient=1e-4, min_densify_every=16, min_settle=8
 )
 CONFIGS = {
     "ga": lambda: GA(GAConfig(splats=FAST)),
     "flashavatar": lambda: FlashAvatar(FlashAvatarConfig(**SMALL_FLASHAVATAR)),
     "ours": lambda: Ours(changed(SMALL, splats=FAST, hidden=16, planes={"resolution": 16})),
-    "gbs": lambda: GBS(GBSConfig(splats=BLENDSHAPES, samples=600, teeth_samples=40, min_sh_every=30)),
+    "gbs": lambda: GBS(GBSConfig(splats=BLENDSHAPES, samples=600, teeth_samples=40, min_sh_every=12)),
     "rgbavatar": lambda: RGBAvatar(RGBAvatarConfig(**SMALL_RGBAVATAR)),
 }
 STORED = {name: "point_cloud.ply" if name == "ga" else "avatar.safetensors" for name in CONFIGS}
@@ -54,7 +54,7 @@ def fitted(request, clip, tmp_path_factory):
     """Method name, folder and avatar after a few iterations with a densification."""
     folder = tmp_path_factory.mktemp(request.param)
     method = CONFIGS[request.param]()
-    avatar = method.fit(clip, folder, Budget(iterations=90), device="cpu", seed=0, progress=no_progress)
+    avatar = method.fit(clip, folder, Budget(iterations=36), device="cpu", seed=0, progress=no_progress)
     return request.param, method, folder, avatar
 
 
@@ -105,7 +105,7 @@ def test_a_finished_run_is_kept_and_another_run_is_refused(fitted, clip):
 
     for seed, refusal in ((0, nullcontext()), (1, pytest.raises(InputError, match="another run"))):
         with refusal:
-            method.fit(clip, folder, Budget(iterations=90), device="cpu", seed=seed, progress=fail)
+            method.fit(clip, folder, Budget(iterations=36), device="cpu", seed=seed, progress=fail)
 
 
 def test_damaged_files_are_input_errors(fitted, tmp_path):
@@ -210,7 +210,7 @@ def test_ga_harmonics_are_stored_channel_by_channel(clip, tmp_path):
 
 def test_ours_costs_48_bytes_per_splat_beside_what_is_fixed(clip, tmp_path):
     sizes = {}
-    for iterations in (2, 90):
+    for iterations in (2, 36):
         folder = tmp_path / str(iterations)
         avatar = CONFIGS["ours"]().fit(
             clip, folder, Budget(iterations=iterations), device="cpu", seed=0, progress=no_progress

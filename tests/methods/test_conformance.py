@@ -16,20 +16,22 @@ from headbench.bench.registry import discover
 from headbench.bench.specs import MethodSpec
 
 from .flashavatar.small import SMALL as SMALL_FLASHAVATAR
+from .gha.small import SMALL as SMALL_GHA
 from .insta.small import SMALL as SMALL_INSTA
 from .rgbavatar.small import SMALL as SMALL_RGBAVATAR
 from .toy_clip import toy_pose
 
+SHORT = {"budget": {"iterations": 12}, "checkpoint_every_s": 0.0}
 TRAINED = {
-    "budget": {"iterations": 24},
-    # Rounds at 8 and 16, resets at 10 and 20.
-    "splats": {"min_densify_every": 8, "min_reset_every": 10, "min_settle": 2, "checkpoint_every_s": 0.0},
+    "budget": SHORT["budget"],
+    # Rounds at 4 and 8.
+    "splats": {"min_densify_every": 4, "min_settle": 2, "checkpoint_every_s": 0.0},
 }
 OWN_TRAINING = {
-    "flashavatar": {"budget": {"iterations": 24}, "checkpoint_every_s": 0.0, **SMALL_FLASHAVATAR},
-    "gha": {"budget": {"iterations": 24}, "grid_vertices": 3_000, "start_steps": 20, "motion_steps": 20},
-    "insta": {"budget": {"iterations": 24}, "checkpoint_every_s": 0.0, **SMALL_INSTA},
-    "rgbavatar": {"budget": {"iterations": 24}, "checkpoint_every_s": 0.0, **SMALL_RGBAVATAR},
+    "flashavatar": {**SHORT, **SMALL_FLASHAVATAR},
+    "gha": {**SHORT, **SMALL_GHA, "motion_steps": 20},
+    "insta": {**SHORT, **SMALL_INSTA},
+    "rgbavatar": {**SHORT, **SMALL_RGBAVATAR},
 }
 """Methods that do not train splats bound to the mesh, with their own short settings."""
 SMALL = {

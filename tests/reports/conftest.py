@@ -1,5 +1,6 @@
 import itertools
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from headbench.bench.engine.store import RunFolder
 from headbench.bench.manifest import Manifest, MethodRecord, ProtocolRecord
 from headbench.bench.rows import Rows
 from headbench.bench.specs import MetricSpec
+from headbench.reports.pareto import plot
 
 from ..world import run_on
 from .made_rows import TASKS, avatar_row, row
@@ -110,14 +112,25 @@ def toy_run(make_run):
     return make_run("out", methods=("toy_plugin:METHOD", "toy_plugin:FAILING"), metrics=metrics)
 
 
+@pytest.fixture(scope="session")
+def made_runs(tmp_path_factory):
+    """Folder of each toy run of this session, with its captures, by settings."""
+    return tmp_path_factory.mktemp("made"), {}
+
+
 @pytest.fixture
-def make_run(toy, tmp_path):
-    """Run a toy comparison over two subjects into a folder of that name; changes are settings of the run."""
+def make_run(toy, tmp_path, made_runs):
+    """Copy a toy comparison over two subjects into a folder of that name; changes are settings of the run."""
+    place, made = made_runs
 
     def make(name, methods=("toy_plugin:METHOD",), subjects=("subject1", "subject2"), **changes):
-        data = tmp_path / ("data" if len(subjects) > 1 else f"data-{subjects[0]}")
         settings = {"metrics": ("toy_plugin:ERROR", "toy_plugin:FILES"), "reader": "toy_plugin:READER"}
-        return run_on(data, tmp_path / name, *methods, subjects=subjects, **settings | changes).root
+        key, data = repr((methods, subjects, changes)), "data" if len(subjects) > 1 else f"data-{subjects[0]}"
+        if key not in made:
+            made[key] = place / str(len(made)) / "run"
+            run_on(made[key].with_name(data), made[key], *methods, subjects=subjects, **settings | changes)
+        shutil.copytree(made[key].with_name(data), tmp_path / data, dirs_exist_ok=True)
+        return Path(shutil.copytree(made[key], tmp_path / name))
 
     return make
 
@@ -160,3 +173,10 @@ def write_run(tmp_path, write_manifest):
         return folder.root
 
     return write
+
+
+@pytest.fixture
+def no_plots(monkeypatch):
+    """Leave out the drawing of `report pareto`, which takes longer than all else it does."""
+    for name in ("write_plot", "write_rates"):
+        monkeypatch.setattr(plot, name, lambda *args, **options: None)

@@ -4,6 +4,8 @@ import pytest
 
 from headbench.reports.table_report import table_text
 
+pytestmark = pytest.mark.commands
+
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_nothing_serious_in_a_table(new_tab, serious, write_run, scheme):

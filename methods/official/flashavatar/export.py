@@ -82,10 +82,7 @@ def has_their_topology(head: HeadAsset, folder: Path) -> bool:
 
 
 def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout, *, own_chart: bool) -> FlameSubject:
-    """The head model, with its teeth if it has a chart of its own, and one identity.
-
-    Raises `InputError` without regions, and without ``own_chart`` for another topology than FLAME's.
-    """
+    """The head model, with its teeth if it has a chart of its own, and one identity."""
     for name in (BOUNDARY, MOUTH):
         region(head, name)
     if not own_chart:
@@ -165,11 +162,6 @@ def chart_of_points(vertices: FloatArray, faces: IntArray, barycentric: FloatArr
         (V, 3) metres; (P, 3) triangle and (P, 3) barycentric coordinates of each point.
     grid : int
         Texels of a side.
-
-    Raises
-    ------
-    InputError
-        There are more points than texels.
     """
     if len(faces) > grid**2:
         raise InputError("head model", "points", f"at most {grid**2}, as many as texels", str(len(faces)))

@@ -173,10 +173,7 @@ class OfficialTracking:
         save_npz(path, self.parameters(pose))
 
     def parameters(self, pose: HeadPose) -> dict[str, np.ndarray]:
-        """Parameters of one timestep, padded: ``shape`` (300,), ``static_offset`` (1, V, 3), all others with one row.
-
-        Raises `InputError` for a pose of another head model.
-        """
+        """Parameters of one timestep, padded: ``shape`` (300,), ``static_offset`` (1, V, 3), all others with one row."""
         version = self.head.head.version
         if pose.head_model != version:
             raise InputError("pose", "head_model", repr(version), repr(pose.head_model))

@@ -120,10 +120,7 @@ def _towards(direction: FloatArray) -> FloatArray:
 
 
 def square(camera: Camera, side: int) -> Window:
-    """The square window around an image with the principal point in its middle; pixels need not be square.
-
-    Raises `InputError` for a side below `square_side`.
-    """
+    """The square window around an image with the principal point in its middle; pixels need not be square."""
     K = np.asarray(camera.K, np.float64)
     (left, off_x), (top, off_y) = (_centred(float(K[axis, 2]), side) for axis in range(2))
     if not _encloses(camera, side):

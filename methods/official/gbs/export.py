@@ -63,10 +63,7 @@ def held_out(checkout: Checkout) -> int:
 
 
 class VideoHead:
-    """A head model and one identity for their code: without teeth, with the static offset in the template.
-
-    Raises `InputError` if their code does not support the head.
-    """
+    """A head model and one identity for their code: without teeth, with the static offset in the template."""
 
     def __init__(self, subject: Subject, head: Any, checkout: Checkout):
         self.official = OfficialHead.numbered(head)

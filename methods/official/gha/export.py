@@ -219,10 +219,7 @@ def _resized(image: Any, side: int) -> Any:
 
 
 def read_render(path: Path, frame: Listed, side: int, rendered: int) -> tuple[ByteArray, FloatArray]:
-    """Input image and render of a file: the render (H, W, 3) in [0, 1] at its camera's size.
-
-    Raises `InputError` for a file that is not two squares of ``rendered`` pixels.
-    """
+    """Input image and render of a file: the render (H, W, 3) in [0, 1] at its camera's size."""
     image = read_sized(path, frame, 2 * rendered, rendered)
     render = _resized(image[:, rendered:].astype(np.float32) / 255, side)
     return image[:, :rendered], square(frame.camera, side).uncut(render, frame.camera)

@@ -180,8 +180,9 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
             }
             path = work.root / f"{place.name}.yaml"
             write_json(path, config)
-            part = {"script": REENACTMENT, "config": str(path), "numbers": numbers, "renders": str(renders)}
-            parts.append(part)
+            before = sum(len(part["numbers"]) for part in parts)
+            part = {"script": REENACTMENT, "config": str(path), "numbers": numbers, "before": before}
+            parts.append({**part, "renders": str(renders)})
         write_json(work.root / SIDE_FILE, {"side": side})
         return self._staged(work, parts, 0)
 

@@ -90,12 +90,12 @@ def numbered(part):
     write = cv2.imwrite
 
     def imwrite(path, image, *rest):
-        number = part["numbers"][int(os.path.splitext(os.path.basename(path))[0])]
-        path = os.path.join(part["renders"], f"{number:06d}.png")
+        index = int(os.path.splitext(os.path.basename(path))[0])
+        path = os.path.join(part["renders"], f"{part['numbers'][index]:06d}.png")
         done = write(path, image)
         if not done:
             raise OSError(f"OpenCV could not write {path}")
-        print(f"\nheadbench: drawn {number + 1}", flush=True)
+        print(f"\nheadbench: drawn {part['before'] + index + 1}", flush=True)
         return done
 
     cv2.imwrite = imwrite

@@ -49,11 +49,7 @@ def chart_of(head: HeadAsset) -> FloatArray:
 
 
 def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout, *, own_chart: bool) -> FlameSubject:
-    """The head model, with its teeth if its own chart is used, and one identity.
-
-    Raises `InputError` for a head without a chart of its own, or without ``own_chart`` unless its triangles are those of the checkout's
-    texture chart.
-    """
+    """The head model, with its teeth if its own chart is used, and one identity."""
     if own_chart:
         chart_of(head)
         return FlameSubject.whole(head, subject)
@@ -91,10 +87,7 @@ def write_program(identity: Subject, head: HeadAsset, work: Workplace, *, own_ch
 
 
 def write_config(path: Path, checkout: Checkout, changes: Mapping[str, Any]) -> None:
-    """Write their published configuration with other values of some entries.
-
-    Raises `InputError` if the published one does not have each of them once.
-    """
+    """Write their published configuration with other values of some entries."""
     source = checkout.folder / CONFIG
     text = read_bytes(source, "a configuration").decode(errors="replace")
     for name, value in changes.items():

@@ -118,11 +118,6 @@ def rasterize_chart(
     -------
     tuple[Tensor, None]
         (1, S, S, 4): first two barycentric coordinates, z, and the number of the triangle from 1, all 0 without a triangle.
-
-    Raises
-    ------
-    ValueError
-        The sides differ.
     """
     if resolution[0] != resolution[1]:
         raise ValueError("expected a square; the shim does not support other charts")

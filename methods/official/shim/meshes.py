@@ -115,11 +115,6 @@ def rasterize_meshes(
     tuple[Tensor, Tensor, Tensor, None]
         (1, S, S, 1) int64 triangle, -1 for none; (1, S, S, 1) float32 z; (1, S, S, 1, 3) float32 barycentric coordinates, -1 without a
         triangle; nothing in place of distances.
-
-    Raises
-    ------
-    ValueError
-        More than one triangle for each pixel, blur, or perspective correction is requested.
     """
     if blur_radius or faces_per_pixel != 1 or perspective_correct:
         raise ValueError("expected one triangle for each pixel, without blur and perspective correction")

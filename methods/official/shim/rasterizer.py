@@ -72,12 +72,6 @@ class GaussianRasterizer(nn.Module):
         tuple[Tensor, ...]
             Image (3, H, W); coverage (H, W) if requested; radii (N,), positive for every splat in view, regardless of its
             opacity.
-
-        Raises
-        ------
-        ValueError
-            Both or neither of harmonics and colours are given, covariances are given, or coverage
-            by a part of the splats is requested.
         """
         to = self.raster_settings
         if (shs is None) == (colors_precomp is None):

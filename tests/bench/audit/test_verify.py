@@ -68,7 +68,7 @@ def test_a_changed_frame_is_found_by_its_digest_and_its_values(verify, run):
     assert verify()[0] == 0
 
 
-def test_frames_that_the_avatar_does_not_render_are_found_by_rendering_again(verify, run, toy, monkeypatch):
+def test_frames_that_the_avatar_does_not_render_are_found(verify, run, toy, monkeypatch):
     assert verify("--render")[0] == 0
     original = toy.ToyAvatar.render
 

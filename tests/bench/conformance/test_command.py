@@ -13,6 +13,8 @@ from headbench.bench import cli, contracts, errors, registry, specs
 from headbench.bench.conformance import command
 from headbench.bench.engine import captures
 
+from ...world import capture
+
 PLUGINS = ("grey:SPEC", "outside_reader:SPEC", "mae:MAE") + tuple(
     f"outside_metric:{name}" for name in ("ERROR", "JUMP", "FILES", "HOURS")
 )
@@ -76,7 +78,8 @@ def test_an_experiment_written_outside_runs_its_conditions(
 
 
 def test_a_method_written_outside_draws_the_tracked_mesh(outside, capsys):
-    assert cli.main(["doctor", "check", "outside_method:SPEC"]) == 0, capsys.readouterr().out
+    words = ["doctor", "check", "outside_method:SPEC", "--data", str(capture().union)]
+    assert cli.main(words) == 0, capsys.readouterr().out
 
 
 @pytest.fixture

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from headbench import FrameKey, check_reader
+from headbench.datasets.specs import GA_LAYOUT
+
+from ...world import capture
 
 
 def everything(change):
@@ -165,9 +168,5 @@ def test_a_reader_that_finds_nothing_does_not_conform(reader, tmp_path):
     assert check_reader(reader.module.SPEC, tmp_path / "empty")[0].startswith("find lists nothing under")
 
 
-def test_our_own_reader_conforms(tmp_path):
-    from headbench.datasets.specs import GA_LAYOUT
-
-    from ...datasets.tiny_capture import write_tiny_capture
-
-    assert check_reader(GA_LAYOUT, write_tiny_capture(tmp_path / "capture").writer.root) == []
+def test_our_own_reader_conforms():
+    assert check_reader(GA_LAYOUT, capture().writer.root) == []

@@ -80,7 +80,7 @@ def test_rows_are_those_of_one_process_and_done_cells_are_kept(config, rows_of, 
     assert "2 done, 2 failed" in capsys.readouterr().out
 
 
-def test_a_killed_process_is_started_again_until_its_restarts_end(config, rows_of):
+def test_a_killed_process_is_started_again_up_to_its_restarts(config, rows_of):
     config = replace(config, methods=("dying_plugin:DYING", "dying_plugin:ALWAYS", "toy_plugin:METHOD"))
     rows = rows_of(config, replace(TWO, restarts=1))
     by_method = dict(iter(rows.groupby("method")))
@@ -102,29 +102,15 @@ def test_a_full_disk_ends_the_run_and_no_cell_is_failed(config):
     assert not RunFolder(Path(config.out)).rows.exists()
 
 
-def test_speed_is_measured_after_the_trainings_alone(config, rows_of):
-    config = replace(config, methods=("dying_plugin:DYING",), metrics=("psnr", "toy_plugin:ERROR", "fps"))
-    rows = rows_of(config, TWO)
-    assert set(rows["status"]) == {"ok"}
-    assert rows["metric"].drop_duplicates().tolist() == ["psnr", "error", "fps"]
-    spans = []
-    for subject in ("subject1", "subject2"):
-        outcome = read_outcome(cell_of(config, subject, "dying"))
-        assert (outcome["speed"], outcome["restarts"]) == (True, 1)
-        spans.append(outcome["process"])
-    assert len(set(spans)) == 1  # one process, one after another
-
-
 def test_kept_cells_are_named_and_changed_code_fails_others(config, rows_of, caplog):
     caplog.set_level("INFO", logger="headbench")
-    config = replace(config, methods=("toy_plugin:METHOD",), metrics=("fps",))
-    assert set(rows_of(config, TWO)["status"]) == {"ok"}  # speed alone
-    assert ": kept" not in caplog.text
+    config = replace(config, methods=("toy_plugin:METHOD",))
+    rows_of(config)
     folder = RunFolder(Path(config.out))
     own = folder.read_manifest().machine
     for subject, processor in (("subject1", "A"), ("subject2", "B")):
-        path = cell_of(config, subject, "toy") / "outcome.json"
-        write_json(path, {**read_json(path), "machine": {**own, "processor": processor}})
+        machine = {**own, "processor": processor}
+        write_outcome(cell_of(config, subject, "toy"), {"status": "done", "speed": False, "machine": machine})
     runner.run(config, TWO)
     assert caplog.text.count("toy seed 0: kept: trained ") == 2
     assert folder.read_manifest().machine == {**own, "processor": "A and B"}
@@ -137,7 +123,7 @@ def test_kept_cells_are_named_and_changed_code_fails_others(config, rows_of, cap
         _Run.read(folder.root)
 
 
-def test_ended_while_speed_is_measured_it_goes_on_with_that(config, rows_of, tmp_path, monkeypatch):
+def test_speed_is_measured_last_and_alone_also_after_an_end(config, rows_of, tmp_path, monkeypatch):
     config = replace(
         config, methods=("toy_plugin:METHOD", "dying_plugin:FAILING_ONCE"), metrics=("psnr", "fps")
     )
@@ -148,6 +134,9 @@ def test_ended_while_speed_is_measured_it_goes_on_with_that(config, rows_of, tmp
     rows = rows_of(config, TWO)
     assert set(rows[rows["method"] == "toy"]["status"]) == {"ok"}
     assert set(rows[rows["method"] == "once"]["status"]) == {"failed"}  # not trained again in that pass
+    outcomes = [read_outcome(cell_of(config, subject, "toy")) for subject in ("subject1", "subject2")]
+    assert [outcome["speed"] for outcome in outcomes] == [True, True]
+    assert outcomes[0]["process"] == outcomes[1]["process"]  # one after another
     again = rows_of(config, TWO)
     assert set(again["status"]) == {"ok"}  # but by a start after the run has ended
 

@@ -169,7 +169,7 @@ REFUSED = {
     "disk full": (
         "echo Submitted batch job 7",
         f"echo JobState=FAILED ExitCode={errno.ENOSPC}:0",
-        r"subject1/toy/seed-0: No space left on device \(job 7\).*Free disk space",
+        r"subject1/toy/seed-0: No space left on device \(job 7_0\).*Free disk space",
     ),
 }
 

@@ -19,8 +19,9 @@ from headbench.datasets.synthetic.panels import default_samples
 from headbench.datasets.synthetic.performance import EXPRESSION_CONTROLS
 from headbench.datasets.synthetic.plan import SyntheticSettings, load_geometry, plan_subject
 from headbench.methods.ours.spec import ADDITIONS, OURS, OURS_PLUS
-from headbench.reports.readme import GALLERY, SUITE, suite_options
 from headbench.reports.suite.suite import suite_runs
+
+from ...docs_ext import stored_results
 
 SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16")
 
@@ -79,10 +80,10 @@ def asked(monkeypatch, tmp_path):
 
 
 def test_the_stored_suite_can_be_made_again_by_its_options(asked):
-    folder = Path(__file__).parents[3] / GALLERY / SUITE
-    first, *_ = suite_runs(folder)
+    results = stored_results.StoredResults(Path(__file__).parents[3])
+    first, *_ = suite_runs(results.suite)
     stored = RunFolder(first).read_manifest()
-    (capture, config), *_ = asked(*suite_options(folder))
+    (capture, config), *_ = asked(*results.options())
     names = ("subjects", "cameras", "timesteps", "size", "seed", "performance", "tracking_error", "tracker")
     samples = default_samples(*capture["size"])
     planned = SyntheticSettings(

@@ -121,7 +121,7 @@ def test_an_error_of_the_system_names_the_file_meant(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_is_on_disk_before_its_rename_and_a_failing_disk_leaves_the_old_one(tmp_path, monkeypatch):
+def test_a_file_is_flushed_before_its_rename(tmp_path, monkeypatch):
     """Filesystems that write later report a full disk only here."""
     path, seen = tmp_path / "new" / "a", []
     monkeypatch.setattr(

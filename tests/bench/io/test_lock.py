@@ -23,7 +23,7 @@ with locked(Path(sys.argv[1])):
 """
 
 
-def test_a_folder_that_another_process_uses_is_refused_until_that_is_killed(tmp_path):
+def test_a_folder_in_use_by_another_process_is_refused(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True
     )
@@ -40,7 +40,7 @@ def test_a_folder_that_another_process_uses_is_refused_until_that_is_killed(tmp_
         assert json.loads((tmp_path / LOCK_FILE).read_text())["process"] == os.getpid()
 
 
-def test_one_process_does_not_enter_twice_and_a_damaged_lock_file_is_no_obstacle(tmp_path):
+def test_one_process_enters_once_and_a_damaged_lock_is_ignored(tmp_path):
     (tmp_path / LOCK_FILE).write_text("[1, 2")
     with locked(tmp_path):
         for content, owner in ((None, f"process {os.getpid()}"), ("[1, 2", "of unknown number")):
@@ -68,7 +68,7 @@ def test_lock_and_log_are_never_links(tmp_path, name):
     assert victim.read_text() == "victim"
 
 
-def test_what_killed_processes_left_is_removed_except_where_another_works(tmp_path):
+def test_leftovers_of_killed_processes_are_removed(tmp_path):
     (tmp_path / "below").mkdir()
     left = tmp_path / "below" / f"{TEMPORARY}x.png"
     left.touch()

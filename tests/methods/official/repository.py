@@ -1,4 +1,4 @@
-"""A stand-in for an official repository: its file names, options and output, a few lines of Python behind them."""
+"""Stand-ins for the official repositories: file names, options and output of theirs around a few lines that draw what was exported."""
 
 from __future__ import annotations
 
@@ -8,279 +8,643 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from headbench.bench.contracts import Budget, no_progress
-from headbench.bench.engine.guard import TrainingView
-from headbench.bench.io.arrays import check_arrays
-from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import lip_rings
-from headbench.datasets.tracker_files.metrical import MEMBERS, metrical_frame
-from headbench.methods.official.config import GAOfficialConfig
+from headbench.methods.official.flashavatar.method import FlashAvatarOfficial
 from headbench.methods.official.ga.method import GAOfficial
+from headbench.methods.official.gbs.method import GBSOfficial
 from headbench.methods.official.gha.method import GHAOfficial
+from headbench.methods.official.insta.export import MASKS
+from headbench.methods.official.insta.method import INSTAOfficial
+from headbench.methods.official.rgbavatar.method import RGBAvatarOfficial
 from headbench.methods.official.tga.method import TGAOfficial
-from headbench.methods.official.workplace import Workplace
-
-BUDGET = Budget(iterations=20)
-
-
-def fit(method, clip, out, progress=no_progress, *, budget=BUDGET, seed=0):
-    """Train on the clip's training frames."""
-    return method.fit(TrainingView(clip), out, budget, device="cpu", seed=seed, progress=progress)
-
-
-def views(clip, *splits):
-    """Camera and pose by key, of the frames of some splits."""
-    return {k: (clip.cameras[k.camera], clip.poses[k.timestep]) for s in splits for k in clip.splits[s]}
-
-
-WHITE = (1.0, 1.0, 1.0)
-
-
-def renders(avatar, clip, ground=WHITE):
-    """Frames of the held-out view by key."""
-    return dict(avatar.render_listed(views(clip, "novel_view"), ground, no_progress))
-
-
-def rendered(avatar, wanted, ground=WHITE):
-    """Frames of a list by key; each is there in the size of its camera, and the progress goes up to their number."""
-    done = []
-    found = dict(avatar.render_listed(wanted, ground, lambda count, total, note="": done.append(count)))
-    assert found.keys() == wanted.keys()
-    assert done == sorted(done)
-    assert done[-1] == len(wanted)
-    for key, (camera, _) in wanted.items():
-        assert found[key].rgb.shape == (camera.height, camera.width, 3)
-    return found
-
-
-def with_an_odd_size(wanted):
-    """The same list, whose first frame has another width than the others."""
-    odd, (camera, pose) = next(iter(wanted.items()))
-    return wanted | {odd: (replace(camera, width=30), pose)}
-
-
-def workplace(method, folder):
-    """An empty place to export to."""
-    work = Workplace.at(folder, method.inspect())
-    work.make()
-    return work
-
-
-def export(method, clip, folder):
-    """Export the clip's training frames: the place, and the images in it by key."""
-    work = workplace(method, folder)
-    return work, method.export(TrainingView(clip), work, no_progress)
-
-
-class Killed(KeyboardInterrupt):
-    """What a signal raises."""
-
-
-def kill_at(iteration, clip):
-    """A progress that raises `Killed` in this iteration of a training."""
-    frames = len(clip.splits["train"])
-
-    def progress(done, total, note=""):
-        if done >= frames + iteration:
-            raise Killed
-
-    return progress
-
-
-def read_tracked(path):
-    """A frame's file by torch and the formulae of the reader of the tracker's files.
-
-    That reader has height before width, the programs that the file is for have width first.
-    """
-    with torch.serialization.safe_globals([np.ndarray]):
-        content = torch.load(path, weights_only=True)
-    arrays = {
-        f"{part}.{name}": array for part in ("flame", "opencv") for name, array in content[part].items()
-    }
-    arrays["img_size"] = content["img_size"][::-1]
-    check_arrays(path, arrays, MEMBERS)
-    return metrical_frame(path, int(path.stem), arrays)
-
-
-def check_tracked(found, clip, key, window=None):
-    """A frame's file has the pose of a clip's frame, and the camera of its image, or of a window of it."""
-    camera, pose = clip.cameras[key.camera], clip.poses[key.timestep]
-    shown = camera if window is None else window.camera
-    assert (found.width, found.height) == (shown.width, shown.height)
-    size = len(pose.expression)
-    assert np.array_equal(found.expression[:size], pose.expression)
-    assert found.expression.shape == (100,)
-    assert not found.expression[size:].any()
-    assert found.shape.shape == (300,)
-    assert np.abs(found.shape[: len(clip.shape)] - clip.shape).max() < 1e-6
-    for name in ("eyelids", "jaw", "eyes"):
-        assert np.abs(getattr(found, name) - getattr(pose, name)).max() < 1e-6
-    subject = PosedSubject.of(clip)
-    points, motion = subject.neutral[::7], subject.motions([pose])[0]
-    world = points @ motion[:3, :3].T + motion[:3, 3]
-    local = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    theirs = points @ found.world_to_camera[:3, :3].T + found.world_to_camera[:3, 3]
-    here, there = ((p @ K.T)[:, :2] / p[:, 2:] for p, K in ((local, camera.K), (theirs, found.K)))
-    there = there if window is None else there + [window.left, window.top]
-    return float(np.abs(here - there).max())
-
 
 LINES_BEGIN = 12
 """Iteration at which the stand-in of TGA's training begins to train feature lines."""
+HELD_OUT = 7
+"""Frames at the end that the stand-in of GaussianBlendshapes holds out; another number than the original's, so that it has to be read."""
+CYLINDER = (0.0, -0.05, 0.02)
 
 COMMON = """
-import argparse, json, os, sys, time
+import argparse, io, json, os, sys, time, zipfile
 from pathlib import Path
 from pickle import load
 import numpy as np
 from PIL import Image
 
-parser = argparse.ArgumentParser()
-for name in ("source_path", "model_path", "iterations", "iteration"):
-    parser.add_argument("--" + name)
-arguments, others = parser.parse_known_args()
-source, model = Path(arguments.source_path), Path(arguments.model_path)
-here = Path(__file__).parent
-behaviour = (here / "behaviour.txt").read_text() if (here / "behaviour.txt").exists() else ""
-with open("flame_model/assets/flame/flame2023.pkl", "rb") as stream:
-    head = load(stream, encoding="latin1")
-with open("flame_model/assets/flame/FLAME_masks.pkl", "rb") as stream:
-    masks = load(stream, encoding="latin1")
-landmarks = np.load("flame_model/assets/flame/landmark_embedding_with_eyes.npy")[()]
-assert landmarks["full_lmk_faces_idx"].shape == (1, 70)
-assert head["shapedirs"].shape[2] == 400 and head["posedirs"].shape[-1] == 36
+PLACE = Path({place!r})
+behaviour = (PLACE / "behaviour.txt").read_text() if (PLACE / "behaviour.txt").exists() else ""
+if os.path.isdir("../model"):
+    print("finds", sorted(os.listdir("../model")))
 
-def frames(split):
-    return json.loads((source / f"transforms_{split}.json").read_text())["frames"]
-"""
+def options(*names, flags=()):
+    parser = argparse.ArgumentParser()
+    for name in names:
+        parser.add_argument("--" + name)
+    for name in flags:
+        parser.add_argument("--" + name, action="store_true")
+    return parser.parse_known_args()[0]
 
-TRAIN = """
-print("environment", sorted(os.environ))
-listed = frames("train")
-assert not frames("val") and not frames("test")
-meshes = {f["timestep_index"]: dict(np.load(source / f["flame_param_path"])) for f in listed}
-assert sorted(meshes) == list(range(len(meshes)))
-sizes = {Image.open(source / f["file_path"]).size == (f["w"], f["h"]) for f in listed}
-assert sizes == {True}
-iterations = int(arguments.iterations)
-model.mkdir(parents=True, exist_ok=True)
-print("finds", sorted(path.name for path in model.iterdir()))
-for iteration in range(1, iterations + 1):
-    bar = f"\\rTraining progress:  {iteration}%|#| {iteration}/{iterations} [00:01<00:10, 5.0it/s, Loss=0.{iteration}]"
-    print(bar, end="", flush=True)
-    (model / "checkpoint").write_text(str(iteration))
-    if behaviour == "crash" and iteration == 5:
+def train(count, line, step=1):
+    # The iterations of a training, each with a line of its output.
+    print("environment", sorted(os.environ))
+    for done in range(step, count + 1, step):
+        yield done
+        hangs = done == 5 * step and behaviour == "hang"
+        if hangs:
+            child = os.fork()
+            time.sleep(0 if child else 60)
+            (PLACE / "pids.txt").write_text(f"{{os.getpid()}} {{child}}")
+        print(line.format(done=done, count=count), flush=True)
+        if done == 5 * step and behaviour == "crash":
+            raise RuntimeError("CUDA out of memory")
+        time.sleep(60 * hangs)
+
+def write(path, content):
+    if behaviour != "no output":
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+def order(count):
+    # Number of each render, and the frame that it shows.
+    if behaviour == "crash in rendering":
         raise RuntimeError("CUDA out of memory")
-    if behaviour == "hang" and iteration == 5:
-        child = os.fork()
-        if child:
-            (here / "pids.txt").write_text(f"{os.getpid()} {child}")
-            print(flush=True)
-        time.sleep(60)
-print()
-made = model / "point_cloud" / f"iteration_{iterations}"
-made.mkdir(parents=True)
-(model / "cfg_args").write_text(f"Namespace(white_background={'--white_background' in others})")
-if behaviour != "no ply":
-    (made / "point_cloud.ply").write_bytes(b"ply of " + str(len(listed)).encode())
-dynamic = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
-refined = {name: np.concatenate([meshes[t][name] for t in sorted(meshes)]) for name in dynamic}
-refined["expr"] = refined["expr"] + np.float32(0.25)
-if (source / "sorted_jaw_poses.npz").exists():
-    bases = np.load(source / "sorted_jaw_poses.npz")["jaw_poses"]
-    labels = np.load(source / "train_cluster_16.npz")["labels"]
-    assert bases.shape == (16, 4) and bases.dtype == np.float32
-    assert labels.shape == (len(meshes),) and labels.dtype == np.int64
-    for name in ("triplane.pth", "feat_line.pth"):
-        (made / name).write_bytes(b"tensors")
-np.savez(made / "flame_param.npz", **refined, dynamic_offset=np.zeros((len(meshes), 9, 3), np.float32))
+    for index in range(count):
+        if not (behaviour == "one too few" and index == 1):
+            yield index, count - 1 - index if behaviour == "reversed" else index
+
+def picture(levels, width, height, most=255):
+    image = np.zeros((height, width - (behaviour == "other size"), 3), np.uint8)
+    image[:] = np.floor(np.clip(levels, 0, most))
+    return image
+
+def read_pickle(path):
+    with open(path, "rb") as stream:
+        return load(stream, encoding="latin1")
+
+def read_frame(path):
+    with zipfile.ZipFile(path) as archive:
+        name = next(name for name in archive.namelist() if name.endswith("/data.pkl"))
+        return load(io.BytesIO(archive.read(name)))
 """
 
-RENDER = """
-parameters = np.load(model / "point_cloud" / f"iteration_{arguments.iteration}" / "flame_param.npz")
+# ------------------------------------------------------------------ GaussianAvatars and TensorialGaussianAvatar
+
+GA = """
+from common import *
+arguments = options("source_path", "model_path", "iterations", "iteration", flags=["white_background"])
+source, model = Path(arguments.source_path), Path(arguments.model_path)
+head = read_pickle("flame_model/assets/flame/flame2023.pkl")
+assert head["shapedirs"].shape[2] == 400 and head["posedirs"].shape[-1] == 36
+made = model / "point_cloud" / f"iteration_{arguments.iterations or arguments.iteration}"
+frames = {split: json.loads((source / f"transforms_{split}.json").read_text())["frames"] for split in ("train", "val", "test")}
+"""
+GA_TRAIN = """
+assert not frames["val"] and not frames["test"]
+meshes = {f["timestep_index"]: dict(np.load(source / f["flame_param_path"])) for f in frames["train"]}
+assert all(Image.open(source / f["file_path"]).size == (f["w"], f["h"]) for f in frames["train"])
+for done in train(int(arguments.iterations), "\\rTraining progress:  5%|#| {done}/{count} [00:01<00:10, 5.0it/s, Loss=0.{done}]"):
+    pass
+write(made / "point_cloud.ply", b"ply")
+write(model / "cfg_args", f"Namespace(white_background={arguments.white_background})".encode())
+names = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
+refined = {name: np.concatenate([meshes[t][name] for t in sorted(meshes)]) for name in names}
+refined["expr"] = refined["expr"] + np.float32(0.25)
+made.mkdir(parents=True, exist_ok=True)
+np.savez(made / "flame_param.npz", **refined)
+if (source / "sorted_jaw_poses.npz").exists():
+    for name in ("triplane.pth", "feat_line.pth"):
+        write(made / name, b"tensors")
+"""
+GA_RENDER = """
+parameters = np.load(made / "flame_param.npz")
 folder = model / "test" / f"ours_{arguments.iteration}"
 for name in ("renders", "gt"):
     (folder / name).mkdir(parents=True)
-listed = frames("test")
-shown = listed[::-1] if behaviour == "reversed" else listed
-for index, frame in enumerate(shown):
-    print(f"\\rRendering progress:  5%|#| {index + 1}/{len(listed)} [00:01<00:10]", end="", flush=True)
-    if behaviour == "crash in rendering" and index == 1:
-        raise RuntimeError("CUDA out of memory")
-    if behaviour == "one too few" and index == 1:
-        continue
-    t, width, height = frame["timestep_index"], frame["w"], frame["h"]
-    if behaviour == "other size":
-        width -= 1
-    # What a frame shows: its expression, rotation and camera, and where in the window it is.
-    image = np.zeros((height, width, 3), np.uint8)
-    image[..., 0] = np.clip(100 + 40 * parameters["expr"][t, 0], 0, 255)
-    image[..., 1] = np.clip(100 + 900 * parameters["rotation"][t, 0], 0, 255)
-    image[..., 2] = 20 * int(frame["camera_id"]) % 256
-    Image.fromarray(image).save(folder / "renders" / f"{index:05d}.png")
+for index, at in order(len(frames["test"])):
+    frame = frames["test"][at]
+    t, place = frame["timestep_index"], np.array(frame["transform_matrix"])[:3, 3]
+    levels = [100 + 40 * parameters["expr"][t, 0], 100 + 900 * parameters["rotation"][t, 0], 100 + 200 * place[0]]
+    Image.fromarray(picture(levels, frame["w"], frame["h"])).save(folder / "renders" / f"{index:05d}.png")
     Image.open(source / frame["file_path"]).save(folder / "gt" / f"{index:05d}.png")
+    print(f"\\rRendering progress:  5%|#| {index + 1}/{len(frames['test'])} [00:01<00:10]", end="", flush=True)
 print()
 if (source / "sorted_jaw_poses.npz").exists():
-    assert (model / "point_cloud" / f"iteration_{arguments.iteration}" / "feat_line.pth").exists()
     open("/nowhere/fps.txt", "a")
 """
-
-MODEL = """
+GA_MODEL = """
 self.mesh_lst = torch.zeros([T, {}, 3], requires_grad=False).cuda()
 self.face_center_lst = torch.zeros([T, {}, 3], requires_grad=False).cuda()
 """
 
 
+def lip_numbers(head) -> tuple[tuple[list[int], list[int]], tuple[int, int]]:
+    """Vertices on which the stand-in's teeth would hang, which no vertex of the head has, and its vertices and triangles with teeth."""
+    count, first = len(lip_rings(head)[0]), len(head.template) + 5
+    rings = list(range(first, first + 2 * count, 2)), list(range(first + 1, first + 2 * count, 2))
+    return rings, (max(rings[1]) + 1 + 120, len(head.faces) + 168)
+
+
 def make_repository(folder: Path, rings: tuple[list[int], list[int]], sizes: tuple[int, int]) -> str:
-    """Write the stand-in and commit it; return its commit.
-
-    ``rings`` are the vertices that its teeth would hang on, ``sizes`` the vertices and triangles, teeth included, that
-    TGA's code would fix.
-    """
-    for name in ("scene", "flame_model"):
-        (folder / name).mkdir(parents=True)
-    (folder / "train.py").write_text(f"offset_start_iter = {LINES_BEGIN}\n{COMMON}{TRAIN}")
-    (folder / "render.py").write_text(COMMON + RENDER)
-    (folder / "scene" / "dataset_readers.py").write_text("")
-    (folder / "scene" / "flame_gaussian_model.py").write_text(MODEL.format(*sizes))
-    upper, lower = (", ".join(map(str, ring)) + "," for ring in rings)
-    source = "".join(
-        f'self.v.register_buffer(\n    "lip_outside_ring_{name}",\n    torch.tensor([\n        {ring} \n    ])\n)\n'
-        for name, ring in (("upper", upper), ("lower", lower))
+    """GaussianAvatars' and TGA's, with rings and sizes of `lip_numbers`."""
+    texts = [
+        f'self.v.register_buffer(\n    "lip_outside_ring_{name}",\n    torch.tensor([\n {", ".join(map(str, ring))}, \n    ])\n)\n'
+        for name, ring in zip(("upper", "lower"), rings)
+    ]
+    return made(
+        folder,
+        {
+            "train.py": f"offset_start_iter = {LINES_BEGIN}\n{GA}{GA_TRAIN}",
+            "render.py": GA + GA_RENDER,
+            "scene/dataset_readers.py": "",
+            "scene/flame_gaussian_model.py": GA_MODEL.format(*sizes),
+            "flame_model/flame.py": "".join(texts),
+        },
     )
-    (folder / "flame_model" / "flame.py").write_text(source)
-    return committed(folder)
 
 
-def committed(folder: Path) -> str:
-    """Commit all files of a folder; return the commit."""
+# ------------------------------------------------------------------ Gaussian Head Avatar
+
+GHA_STAGE = """
+from common import *
+from lib.recorder.Recorder import {kind}TrainRecorder
+from lib.trainer.{kind}Trainer import {kind}Trainer
+config = json.loads(Path(sys.argv[2]).read_text())
+data = config["dataset"]
+root, side = Path(data["dataroot"]), data["original_resolution"]
+for place in (root / "images").glob("*/*.jpg"):
+    assert Image.open(place).size == ((256, 256) if "lowres" in place.name else (side, side))
+if behaviour == "crash" and "{kind}".startswith("Gaussian"):
+    raise RuntimeError("CUDA out of memory")
+trainer = {kind}Trainer(len(os.listdir(root / "images")), {kind}TrainRecorder(config["recorder"]))
+if behaviour == "stop":
+    trainer.train = lambda start, epochs: None
+trainer.train(0, 1)
+"""
+GHA_RENDER = """
+from common import *
+import cv2
+config = json.loads(Path(sys.argv[2]).read_text())
+data = config["dataset"]
+root, name = Path(data["dataroot"]), config["recorder"]["name"]
+images, parameters = (sorted(root.glob(data[kind])) for kind in ("image_files", "param_files"))
+folder = Path(config["recorder"]["result_path"]) / name
+folder.mkdir(parents=True)
+assert open(config["load_supres_checkpoint"]).read() == open(config["load_gaussianhead_checkpoint"]).read()
+extrinsic, before, size = np.load(data["camera_path"])["extrinsic"], None, data["resolution"]
+place = -extrinsic[:, :3].T @ extrinsic[:, 3]
+for index, at in order(len(images)):
+    values = np.load(parameters[index])
+    shown = np.concatenate([values["exp_coeff"][0], values["pose"][0]])
+    before = shown if before is None else before * 0.5 + shown * 0.5
+    levels = [100 + 200 * place[0], 100 + 300 * before[-6], 100 + 40 * before[0]]
+    beside = cv2.resize(cv2.imread(str(images[at])), (size, size))
+    cv2.imwrite(str(folder / f"{index:06d}.jpg"), np.hstack([beside, picture(levels, size, size)]))
+"""
+GHA_FILES = {
+    "torch.py": "def manual_seed(seed):\n    print('torch seeded with', seed)\n",  # torch itself takes seconds to import
+    "lib/dataset/Dataset.py": "",
+    "config/config.py": "",
+    "reenactment.py": GHA_RENDER,
+    "train_meshhead.py": GHA_STAGE.format(kind="MeshHead"),
+    "train_gaussianhead.py": GHA_STAGE.format(kind="GaussianHead"),
+    "lib/recorder/Recorder.py": """
+from common import write
+from pathlib import Path
+
+class MeshHeadTrainRecorder:
+    files, loss = ("meshhead",), "loss_rgb"
+
+    def __init__(self, config):
+        self.config = config
+
+    def log(self, values):
+        if values["iter"] % self.config["save_freq"] == 0:
+            for name in self.files:
+                folder = Path(self.config["checkpoint_path"]) / self.config["name"]
+                write(folder / (name + "_latest"), str(values["iter"] + 1).encode())
+
+class GaussianHeadTrainRecorder(MeshHeadTrainRecorder):
+    files, loss = ("gaussianhead", "supres"), "loss_rgb_hr"
+""",
+    "lib/trainer/MeshHeadTrainer.py": """
+class MeshHeadTrainer:
+    def __init__(self, frames, recorder):
+        self.frames, self.recorder = frames, recorder
+
+    def train(self, start_epoch, epochs):
+        for iteration in range(start_epoch, epochs * self.frames):
+            self.recorder.log({"iter": iteration, self.recorder.loss: 0.5})
+""",
+    "lib/trainer/GaussianHeadTrainer.py": "from lib.trainer.MeshHeadTrainer import MeshHeadTrainer as GaussianHeadTrainer",
+}
+
+
+def make_head_avatar_repository(folder: Path) -> str:
+    """Gaussian Head Avatar's, with the file that is downloaded."""
+    commit = made(folder, GHA_FILES)
+    (folder / "assets").mkdir()
+    (folder / "assets" / "tets_data.npz").write_bytes(b"tetrahedra")
+    return commit
+
+
+# ------------------------------------------------------------------ INSTA
+
+INSTA = """#!{python}
+import sys
+sys.path.insert(0, {place!r})
+from common import *
+arguments = options("config", "scene", "snapshot", "width", "height", flags=["no-gui", "version"])
+if arguments.version:
+    print("neural graphics primitives version 1.0dev")
+    sys.exit()
+config = json.loads((Path("configs/nerf") / arguments.config).read_text())
+config = json.loads((Path("configs/nerf") / config["parent"]).read_text()) | config
+assert config["learning_rate"] == 0.25 and not config["render_novel_trajectory"]
+scene = Path(arguments.scene)
+folder = scene.parent if scene.suffix == ".json" else scene
+assert arguments.no_gui and not os.path.isabs(arguments.scene)
+
+def vertices(path):
+    return np.array([line.split()[1:] for line in path.read_text().splitlines() if line.startswith("v")], float)
+
+def frames(part):
+    paths = [path for path in folder.iterdir() if path.suffix == ".json" and part in str(path)]
+    found = [frame for path in paths for frame in json.loads(path.read_text())["frames"]]
+    return sorted(found, key=lambda frame: frame["mesh_path"])
+
+debug = folder / "experiments" / Path(arguments.config).stem / "debug"
+for place in (debug.parent.parent, debug.parent, debug):
+    place.mkdir(exist_ok=True)
+if not arguments.snapshot:
+    for frame in frames("train"):
+        paths = [folder / frame[name] for name in ("file_path", "seg_mask_path", "depth_path")]
+        assert all(Image.open(path).size == (frame["w"], frame["h"]) for path in paths)
+    print("loads", len(frames("train")), config["max_images_gpu"])
+    try:
+        for done in train(config["max_steps"], "\\x1b[0;35mINFO     \\x1b[0;37miteration={{done}} loss=0.{{done}}\\x1b[0m"):
+            pass
+    except RuntimeError:
+        (debug / "overlay").mkdir()
+        Image.new("RGB", (9, 9)).save(debug / "overlay" / "left.png")
+        raise
+    write(debug / "snapshot.msgpack", b"field")
+else:
+    assert config["render_from_snapshot"] and Path(arguments.snapshot).read_bytes() == b"field"
+(debug / "overlay").mkdir()
+listed, recorded = frames("test"), []
+assert len(listed) <= config["max_images_gpu"]
+for index, at in order(len(listed)) if arguments.snapshot else ():
+    frame, matrix = listed[at], np.array(listed[at]["transform_matrix"])
+    recorded.append({{"mesh_path": f"meshes/{{index:05d}}.obj", "transform_matrix": matrix.tolist()}})
+    width, height = int(arguments.width), int(arguments.height)
+    focal = frame["fl_x"] / Image.open(folder / frame["file_path"]).size[1] * height
+    expression = float((folder / frame["exp_path"]).read_text().split()[0])
+    image = picture([30 + 20 * expression, 5000 * vertices(folder / frame["mesh_path"]).std(), focal], width, height, 153)
+    image[0, 0] = np.floor(np.clip(75 + 60 * matrix[:3, 3], 0, 153))
+    if behaviour != "no coverage":
+        image = np.dstack([image, np.full(image.shape[:2], 153, np.uint8)])
+    Image.fromarray(image).save(debug / "overlay" / f"{{index:05d}}.png")
+    print(f"INFO     Recording frame [{{index + 1}}/{{len(listed)}}] in the mode overlay", flush=True)
+if behaviour == "one too few":
+    recorded = [{{"mesh_path": "", "transform_matrix": frame["transform_matrix"]}} for frame in listed]
+if behaviour != "no cameras":
+    (debug / "transforms_overlay.json").write_text(json.dumps({{"frames": recorded}}))
+"""
+
+
+def make_insta_repository(folder: Path, masks: str = "v 0 0 0 1 0 0\nf 1 1 1\n") -> str:
+    """INSTA's, built; ``masks`` is the mesh that tells FLAME's topology."""
+    texts = {f"mesh_masks/{name}.obj": masks for name in MASKS}
+    texts |= {"configs/nerf/main.json": '{"max_steps": 33000, "learning_rate": 0.25}'}
+    commit = made(folder, {".gitignore": "build\n", "src/recorder.cu": "", **texts})
+    program = folder / "build" / "rta"
+    program.parent.mkdir()
+    program.write_text(INSTA.format(python=sys.executable, place=str(folder)))
+    program.chmod(0o755)
+    return commit
+
+
+# ------------------------------------------------------------------ GaussianBlendshapes
+
+GBS = """
+from common import *
+arguments = options(*("source_path model_path iterations checkpoint_iterations test_iterations load_iteration "
+                      "position_lr_max_steps densify_from_iter densify_until_iter opacity_reset_interval").split())
+assert os.environ["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] == "1"
+source, model = Path(arguments.source_path), Path(arguments.model_path)
+assert read_pickle("data/FLAME2020/generic_model.pkl")["shapedirs"].shape[1:] == (3, 400)
+count = len(list(source.glob("checkpoint/*.frame")))
+frames = [read_frame(source / f"checkpoint/{number:05d}.frame") for number in range(count)]
+images = [Image.open(source / f"images/{number:05d}.png") for number in range(count)]
+files = ("fix_chkpnt{}.pth", "mouth0_chkpnt{}.pth", "mouth1_chkpnt{}.pth", "acc{}.npy")
+"""
+GBS_TRAIN = """
+import random
+print("options", vars(arguments))
+taken = []
+for iteration in train(int(arguments.iterations), "\\rTraining progress:  5%|#| {done}/{count} [00:01<00:10, 5.0it/s, Loss=0.{done}]"):
+    viewpoint_stack = list(range(count - HELD_OUT))
+    taken.append(viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1)))
+print("taken", taken)
+for name in files:
+    write(model / name.format(arguments.checkpoint_iterations), name.encode())
+"""
+GBS_RENDER = """
+for name in files:
+    assert (model / name.format(arguments.load_iteration)).read_bytes() == name.encode()
+folder = model / "seq" / f"split_{arguments.load_iteration}"
+folder.mkdir(parents=True)
+for index, at in order(count):
+    found, truth = frames[index], images[at]
+    levels = [60 + 20 * found["flame"]["exp"][0, 0], 60 + 200 * found["flame"]["jaw"][0, 5], 60 + 100 * found["opencv"]["t"][0, 0]]
+    covered = picture([153, 0, 0], *truth.size)
+    shown = {"pred": picture(levels, *truth.size, 153), "pred_mask": covered, "gt": np.asarray(truth)[..., :3]}
+    for name, image in shown.items():
+        if not (behaviour == "no coverage" and name == "pred_mask"):
+            Image.fromarray(image).save(folder / f"{name}_{index:05d}.png")
+    print(f"\\rRendering progress:  5%|#| {index + 1}/{count} [00:01<00:10]", end="", flush=True)
+"""
+
+
+def make_blendshapes_repository(folder: Path, vertices: int) -> str:
+    """GaussianBlendshapes', with ``vertices`` of the eyelid bases, which tell FLAME's topology."""
+    texts = {
+        "train.py": GBS + GBS_TRAIN.replace("HELD_OUT", str(HELD_OUT)),
+        "test.py": GBS + GBS_RENDER,
+        "FLAME/dataset.py": f"self.n_seg = {HELD_OUT} # held out\n",
+        "FLAME/FLAME.py": "",
+        "config/config_blendshapes.py": f"cylinder_params = {[*CYLINDER, 0.03, 0.02]}\n",
+        **{f"data/{name}_billboard_tri.obj": "v 0 0 0\n" for name in ("up", "down")},
+        **{f"data/FLAME2020/{name}.txt": "3\n1\n2\n" for name in ("back_of_head", "neck_exclude_vertex")},
+    }
+    return made(folder, texts, {f"FLAME/blendshapes/{side}_eyelid.npy": vertices for side in "lr"})
+
+
+# ------------------------------------------------------------------ RGBAvatar
+
+CONFIG = """data_dir: /somewhere/INSTA # a comment
+output_dir: ./output/
+template_type: Flame
+
+dataset:
+  pin_memory: True
+
+model:
+  tex_size: 256
+  init_scaling: 0.0008
+
+train:
+  batch_size: 10
+  iteration: 50_000
+
+  recon:
+    blend_start_iter: 3000
+    position_lr_final: 0.000008
+    position_lr_max_steps: 30_000
+"""
+RGB = """
+from common import *
+import yaml
+args = options("subject", "work_name", "config", "output_dir", flags=["preload", "alpha"])
+
+def load_video(config):
+    folder = Path(config["data_dir"]) / args.subject
+    names = sorted(os.listdir(folder / "images"))
+    assert [name[:5] for name in names] == [name[:5] for name in sorted(os.listdir(folder / "checkpoint"))]
+    images = [Image.open(folder / "images" / name) for name in names]
+    return [read_frame(folder / f"checkpoint/{name[:5]}.frame") for name in names], images
+
+assert read_pickle("data/FLAME2020/generic_model.pkl")["J_regressor"].todense().shape[0] == 5
+"""
+RGB_TRAIN = """
+config = yaml.safe_load(Path(args.config).read_text())
+frames, images = load_video(config)
+assert {image.size for image in images} == {tuple(frames[0]["img_size"])} and args.preload
+output = Path(config["output_dir"]) / args.subject / args.work_name
+output.mkdir(parents=True)
+(output / "config.yaml").write_text(Path(args.config).read_text())
+for done in train(config["train"]["iteration"], "\\rTraining:  5%|#| {done}/{count} [00:01<00:10, 5.0it/s]", config["train"]["batch_size"]):
+    pass
+write(output / "model.ply", b"splats")
+"""
+RGB_RENDER = """
+class Tensor:
+    # Values of an image, converted to 8 bits as C does.
+    def __init__(self, values):
+        self.values = values
+
+    def __mul__(self, factor):
+        return Tensor(self.values * factor)
+
+    def clamp(self, low, high):
+        return Tensor(self.values.clip(low, high))
+
+    def to(self, dtype, device):
+        return Tensor(self.values.astype(np.int64) % 256)
+
+    def numpy(self):
+        return self.values.astype(np.uint8)
+
+class torch:
+    uint8 = None
+
+output = Path(args.output_dir) / args.subject / args.work_name
+frames, images = load_video(yaml.safe_load((output / "config.yaml").read_text()))
+assert (output / "model.ply").read_bytes() == b"splats" and args.alpha
+K, (width, height) = frames[0]["opencv"]["K"][0], frames[0]["img_size"]
+(output / "render_image").mkdir()
+for index, at in order(len(frames)):
+    flame, place = frames[at]["flame"], frames[at]["opencv"]["t"][0, 0]
+    image = picture([60 + 20 * flame["exp"][0, 0], 60 + 200 * flame["jaw"][0, 5], 60 + 100 * place], width, height, 153) / 1.0
+    image[0, 0] = K[0, 0], K[0, 2], 300
+    image = np.dstack([image, np.full(image.shape[:2], 153)])
+    image = (Tensor(image / 255) * 255.0).to(dtype=torch.uint8, device='cpu').numpy()
+    mode = np.ascontiguousarray(image[..., :3] if behaviour == "no coverage" else image)
+    Image.fromarray(mode).save(output / "render_image" / f"{index:05d}.png")
+    print(f"\\rRendering:  5%|#| {index + 1}/{len(frames)} [00:01<00:10]", end="", file=sys.stderr, flush=True)
+"""
+
+
+def make_rgbavatar_repository(folder: Path, vertices: int, triangles: int) -> str:
+    """RGBAvatar's, with the sizes of the head of its texture chart."""
+    texts = {
+        "train_offline.py": RGB + RGB_TRAIN,
+        "render.py": RGB + RGB_RENDER,
+        "config/offline.yaml": CONFIG,
+    }
+    texts |= {"dataset/flame_dataset.py": "", "submodules/flame/flame.py": ""}
+    chart = folder / "data/FLAME2020/flame_uv.npz"
+    chart.parent.mkdir(parents=True)
+    np.savez(chart, vt=np.zeros((3, 2)), ft=np.zeros((triangles, 3), np.uint32))
+    return made(folder, texts, {f"data/FLAME2020/{side}_eyelid.npy": vertices for side in "lr"})
+
+
+# ------------------------------------------------------------------ FlashAvatar
+
+FLASH_SCENE = """
+import torch
+from common import *
+
+class Scene_mica:
+    def __init__(self, datadir, mica_datadir, train_type, white_background):
+        self.bg_image = np.asarray(torch.zeros((3, 512, 512)))
+        self.bg_image[:] = np.reshape([white_background, 1, white_background], (3, 1, 1))
+        checkpoints = Path(mica_datadir) / "checkpoint"
+        self.N_frames = len(os.listdir(checkpoints))
+        test_num = 500
+        max_train_num = 10000
+        held_out = self.N_frames - test_num
+        assert held_out >= 0
+        numbers = list(range(self.N_frames))
+        numbers = numbers[:held_out][:max_train_num] if train_type == 0 else numbers[held_out:]
+        first = read_frame(checkpoints / "00000.frame")
+        self.size, self.K = tuple(first["img_size"]), first["opencv"]["K"][0]
+        self.cameras = [self.load(Path(datadir), checkpoints, number) for number in numbers]
+
+    def getCameras(self):
+        return self.cameras
+
+    def load(self, folder, checkpoints, number):
+        names = ("imgs/%05d.jpg", "alpha/%05d.jpg", "parsing/%05d_neckhead.png", "parsing/%05d_mouth.png")
+        images = [Image.open(folder / (name % (number + 1))) for name in names]
+        assert images[0].size == self.size
+        image, *masks = (np.array(image) / 255.0 for image in images)
+        for mask in masks[:2]:
+            image = self.bg_image.T + mask[..., None] * (image - self.bg_image.T)
+        return image, read_frame(checkpoints / ("%05d.frame" % number))
+"""
+FLASH_MODEL = """
+class Chart:
+    def __init__(self):
+        self.uv_size = 128
+        self.vertices = len(range(5023))
+        self.uv_vertices_shape, self.uv_head_idx = {(0, "head"): "the neutral mesh"}, "head"
+        self.deformNet = self
+
+    def training_setup(self):
+        pass
+
+    def load_state_dict(self, state):
+        print("starts with", *state, [*state["fcs.0.weight"].shape])
+"""
+FLASH = """
+from common import *
+import random
+import cv2
+from scene import Scene_mica
+from src.deform_model import Chart
+args = options("idname", "image_res", "seed", "iterations", "checkpoint", flags=["white_background"])
+args.image_res = int(args.image_res)
+boundary = read_pickle("flame/FLAME_masks/FLAME_masks.pkl")["boundary"]
+vertices, chart = len(read_pickle("flame/generic_model.pkl")["v_template"]), Chart()
+listed = [line for line in open("flame/FlameMesh.obj") if line.startswith("f ")]
+print("chart of", chart.uv_size, "for", len(listed), "triangles without", len(boundary), "of", vertices)
+assert chart.vertices == vertices and os.path.exists("flame/landmark_embedding.npy")
+data, tracked = os.path.join("dataset", args.idname), os.path.join("metrical-tracker/output", args.idname)
+scene = Scene_mica(data, tracked, 1 if args.checkpoint else 0, args.white_background)
+"""
+FLASH_TRAIN = """
+import torch
+DeformModel, verts_final = chart, ["the first frame"]
+DeformModel.training_setup()
+gaussians = argparse.Namespace(create_from_verts=lambda points: print("sizes on", points))
+gaussians.create_from_verts(verts_final[0])
+opt = argparse.Namespace(iterations=int(args.iterations))
+print("options", args.seed, len(scene.cameras), "corner", [int(255 * level) for level in scene.cameras[0][0][0, 0]])
+mid_num = 15000
+viewpoint_stack = []
+for iteration in train(opt.iterations, "step: {done}, huber: 0.50000"):
+    if not viewpoint_stack:
+        viewpoint_stack = scene.getCameras().copy()
+    viewpoint_cam = viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1))
+    image, shown = viewpoint_cam[0].transpose(2, 0, 1), viewpoint_cam[1]
+    print("draws %.6f" % shown["flame"]["eyelids"][0, 0], np.round(shown["opencv"]["t"][0], 3).tolist())
+    if iteration % 500 == 0 or iteration==1:
+        save_image = np.zeros((args.image_res, args.image_res*2, 3))
+        save_image[:, :args.image_res, :] = image.transpose(1, 2, 0)
+    if iteration < opt.iterations :
+        print("a step")
+    if iteration % 5000 == 0:
+        write(Path(data) / "log" / "ckpt" / ("chkpnt" + str(iteration) + ".pth"), b"splats")
+"""
+FLASH_TEST = """
+logdir = os.path.join(data, "log")
+assert Path(args.checkpoint).read_bytes() == b"splats"
+out = cv2.VideoWriter(os.path.join(logdir, "test.avi"), 0, 25, (args.image_res * 2, args.image_res), True)
+for iteration, at in order(len(scene.cameras)):
+    truth, frame = scene.cameras[at]
+    levels = [60 + 20 * frame["flame"]["exp"][0, 0], 60 + 200 * frame["flame"]["jaw"][0, 5], scene.K[0, 0]]
+    image = np.zeros_like(truth.transpose(2, 0, 1)) + np.floor(np.clip(levels, 0, 255))[:, None, None]
+    save_image = np.zeros((args.image_res, args.image_res*2, 3))
+    save_image[:, :args.image_res, :] = truth * 255
+    save_image[:, args.image_res:, :] = image.transpose(1, 2, 0)
+    save_image = (save_image + 1e-6).astype(np.uint8)[:, :, [2, 1, 0]]
+    if behaviour == "other size":
+        save_image = save_image[1:]
+    out.write(save_image)
+out.release()
+"""
+FLASH_PLAIN = ("landmark_embedding.npy", "mediapipe/mediapipe_landmark_embedding.npz", "flame_mica.py")
+
+
+def make_flashavatar_repository(folder: Path, vertices: int) -> str:
+    """FlashAvatar's, with ``vertices`` in its mesh."""
+    texts = {
+        "train.py": FLASH + FLASH_TRAIN,
+        "test.py": FLASH + FLASH_TEST,
+        "torch.py": "import numpy as np\n\ndef zeros(shape):\n    return np.zeros(shape)\n",
+        "scene/__init__.py": FLASH_SCENE,
+        "src/deform_model.py": FLASH_MODEL.replace("5023", str(vertices)),
+        "flame/FlameMesh.obj": "vt 0 0\nvn 0 0 1\n" + "v 0 0 0\n" * vertices,
+        **{f"flame/{name}": "" for name in FLASH_PLAIN},
+    }
+    return made(folder, texts, {f"flame/blendshapes/{side}_eyelid.npy": vertices for side in "lr"})
+
+
+# ------------------------------------------------------------------ all
+
+
+def made(folder: Path, texts: dict[str, str], eyelids: dict[str, int] | None = None) -> str:
+    """Write and commit a repository of these texts and of eyelid bases of so many vertices; return the commit."""
+    for name, text in {**texts, "common.py": COMMON.format(place=str(folder))}.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    for name, vertices in (eyelids or {}).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        np.save(folder / name, np.zeros((vertices, 3)))
     options = ("user.name=A", "user.email=a@b.c", "commit.gpgsign=false")
     git = ["git", "-C", str(folder), *(word for option in options for word in ("-c", option))]
     for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "first"]):
         subprocess.run([*git, *words], check=True)
-    done = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True)
-    return done.stdout.strip()
+    return subprocess.run(
+        [*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True
+    ).stdout.strip()
 
 
-class StandIn(GAOfficial):
-    """`GAOfficial` around the stand-in, which needs no module that is not here."""
-
-    repository = replace(GAOfficial.repository, modules=("json",), trial="")
-
-
-class TensorialStandIn(TGAOfficial):
-    """`TGAOfficial` around the stand-in."""
-
-    repository = replace(TGAOfficial.repository, modules=("json",), trial="")
+def stand_in(method: type) -> type:
+    """A method around a stand-in, which needs no module that is not here and has no torch files."""
+    repository = replace(method.repository, modules=("json",), trial="")
+    changed = {"repository": repository, "shrink_command": lambda self, fit, work: None}
+    return type(f"{method.__name__}StandIn", (method,), changed)
 
 
-def settings(checkout: Path, commit: str, **changes) -> GAOfficialConfig:
-    """Settings that find the stand-in."""
-    values = {"checkout": str(checkout), "python": sys.executable, "commit": commit} | changes
-    return GAOfficialConfig(**values)
-
+ADAPTERS = {
+    "ga": (stand_in(GAOfficial), lambda folder, head: make_repository(folder, *lip_numbers(head))),
+    "tga": (stand_in(TGAOfficial), lambda folder, head: make_repository(folder, *lip_numbers(head))),
+    "gbs": (stand_in(GBSOfficial), lambda folder, head: make_blendshapes_repository(folder, 1)),
+    "gha": (stand_in(GHAOfficial), lambda folder, head: make_head_avatar_repository(folder)),
+    "insta": (INSTAOfficial, lambda folder, head: make_insta_repository(folder)),
+    "rgbavatar": (
+        stand_in(RGBAvatarOfficial),
+        lambda folder, head: make_rgbavatar_repository(folder, len(head.template), len(head.faces)),
+    ),
+    "flashavatar": (
+        stand_in(FlashAvatarOfficial),
+        lambda folder, head: make_flashavatar_repository(folder, len(head.template)),
+    ),
+}
+"""Methods by name, and what writes their repository for a head and returns its commit."""
 
 INTERPRETER = """#!{python}
 import json, os, sys
@@ -296,146 +660,3 @@ def make_interpreter(path: Path) -> Path:
     path.write_text(INTERPRETER.format(python=sys.executable))
     path.chmod(0o755)
     return path
-
-
-def lip_numbers(head) -> tuple[tuple[list[int], list[int]], tuple[int, int]]:
-    """Rings and sizes, as `make_repository` takes them: lips at numbers that no vertex of the head has."""
-    count, first = len(lip_rings(head)[0]), len(head.template) + 5
-    rings = list(range(first, first + 2 * count, 2)), list(range(first + 1, first + 2 * count, 2))
-    return rings, (max(rings[1]) + 1 + 120, len(head.faces) + 168)
-
-
-# ------------------------------------------------------------------ Gaussian Head Avatar
-
-HEAD_AVATAR = {
-    "torch.py": "def manual_seed(seed):\n    print('torch seeded with', seed)\n",  # torch itself takes seconds to import
-    "lib/dataset/Dataset.py": "",
-    "config/config.py": "",
-    "lib/recorder/Recorder.py": """
-import os
-
-class MeshHeadTrainRecorder:
-    files, loss = ("meshhead",), "loss_rgb"
-
-    def __init__(self, config):
-        self.config = config
-        self.folder = os.path.join(config["checkpoint_path"], config["name"])
-        os.makedirs(self.folder)
-
-    def log(self, values):
-        assert set(values) == {"iter", self.loss}
-        if values["iter"] % self.config["save_freq"] == 0:
-            for name in self.files:
-                with open(os.path.join(self.folder, name + "_latest"), "w") as stream:
-                    stream.write(str(values["iter"] + 1))
-
-class GaussianHeadTrainRecorder(MeshHeadTrainRecorder):
-    files, loss = ("gaussianhead", "supres"), "loss_rgb_hr"
-""",
-    "lib/trainer/MeshHeadTrainer.py": """
-class MeshHeadTrainer:
-    def __init__(self, frames, recorder):
-        self.frames, self.recorder = frames, recorder
-
-    def train(self, start_epoch, epochs):
-        for iteration in range(start_epoch, epochs * self.frames):
-            self.recorder.log({"iter": iteration, self.recorder.loss: 0.5})
-""",
-    "lib/trainer/GaussianHeadTrainer.py": """
-from lib.trainer.MeshHeadTrainer import MeshHeadTrainer
-
-class GaussianHeadTrainer(MeshHeadTrainer):
-    pass
-""",
-}
-HEAD_AVATAR_STAGE = """
-import json, os, sys
-import cv2
-import numpy as np
-from lib.recorder.Recorder import {recorder} as Recorder
-from lib.trainer.{trainer} import {trainer} as Trainer
-
-assert os.path.exists("assets/tets_data.npz")
-here = os.path.dirname(os.path.abspath(__file__))
-with open(sys.argv[2]) as stream:
-    config = json.load(stream)
-data = config["dataset"]
-side, frames = data["original_resolution"], os.listdir(os.path.join(data["dataroot"], "images"))
-for frame in frames:
-    for camera in data["camera_ids"]:
-        place = os.path.join(data["dataroot"], "images", frame, "%s_" + camera + ".jpg")
-        assert {{cv2.imread(place % kind).shape for kind in ("image", "mask", "visible")}} == {{(side, side, 3)}}
-        small = {{cv2.imread(place % (kind + "_lowres")).shape for kind in ("image", "mask", "visible")}}
-        assert small == {{(256, 256, 3)}}
-        K = np.load(os.path.join(data["dataroot"], "cameras", frame, "camera_" + camera + ".npz"))["intrinsic"]
-        assert K[0, 2] == K[1, 2] == side / 2
-    values = np.load(os.path.join(data["dataroot"], "params", frame, "params.npz"))
-    module = config["meshheadmodule"]
-    assert module["exp_color_mlp"][0] == 128 + values["exp_coeff"].shape[1]
-    assert values["pose"].shape == (1, 6) and values["scale"].shape == (1,)
-    landmarks = np.load(os.path.join(data["dataroot"], "params", frame, "lmk_3d.npy"))
-    assert landmarks.shape[0] >= 66
-behaviour = os.path.join(here, "behaviour.txt")
-behaviour = open(behaviour).read() if os.path.exists(behaviour) else ""
-if behaviour == "crash" and "{trainer}".startswith("Gaussian"):
-    raise RuntimeError("CUDA out of memory")
-trainer = Trainer(len(frames), Recorder(config["recorder"]))
-if behaviour == "stop":
-    trainer.train = lambda start, epochs: None
-trainer.train(0, 1)
-"""
-HEAD_AVATAR_RENDERER = """
-import glob, json, os, sys
-import cv2
-import numpy as np
-
-here = os.path.dirname(os.path.abspath(__file__))
-behaviour = os.path.join(here, "behaviour.txt")
-behaviour = open(behaviour).read() if os.path.exists(behaviour) else ""
-with open(sys.argv[2]) as stream:
-    config = json.load(stream)
-data = config["dataset"]
-images, parameters = (
-    sorted(glob.glob(os.path.join(data["dataroot"], data[kind]))) for kind in ("image_files", "param_files")
-)
-assert len(images) == len(parameters)
-if behaviour == "reversed":
-    images = images[::-1]
-os.makedirs(os.path.join(config["recorder"]["result_path"], config["recorder"]["name"]))
-assert open(config["load_supres_checkpoint"]).read() == open(config["load_gaussianhead_checkpoint"]).read()
-size = data["resolution"] - (2 if behaviour == "other size" else 0)
-before = None
-for index, (image, path) in enumerate(zip(images, parameters)):
-    values = np.load(path)
-    shown = np.concatenate([values["exp_coeff"][0], values["pose"][0]])
-    before = shown if before is None else before * 0.5 + shown * 0.5
-    beside = cv2.resize(cv2.imread(image), (size, size))
-    color = np.clip([120, 100 + 300 * before[-6], 100 + 40 * before[0]], 0, 255)
-    render = np.empty((size, size, 3), np.uint8)
-    render[:] = color.astype(np.uint8)
-    if behaviour == "one too few" and index == 1:
-        continue
-    name = os.path.join(config["recorder"]["result_path"], config["recorder"]["name"], "%06d.jpg" % index)
-    cv2.imwrite(name, np.hstack([beside, render]))
-"""
-
-
-def make_head_avatar_repository(folder: Path) -> str:
-    """Write a stand-in for Gaussian Head Avatar's and commit it; return its commit."""
-    files = dict(HEAD_AVATAR)
-    for script, kind in (("train_meshhead.py", "MeshHead"), ("train_gaussianhead.py", "GaussianHead")):
-        files[script] = HEAD_AVATAR_STAGE.format(recorder=f"{kind}TrainRecorder", trainer=f"{kind}Trainer")
-    files["reenactment.py"] = HEAD_AVATAR_RENDERER
-    for name, text in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
-    commit = committed(folder)
-    (folder / "assets").mkdir()
-    (folder / "assets" / "tets_data.npz").write_bytes(b"tetrahedra")
-    return commit
-
-
-class HeadAvatarStandIn(GHAOfficial):
-    """`GHAOfficial` around the stand-in."""
-
-    repository = replace(GHAOfficial.repository, modules=("json",))

@@ -1,6 +1,5 @@
 """Settings of official methods are looked at before any work: each fault names the setting and the next step."""
 
-import subprocess
 import sys
 from dataclasses import replace
 
@@ -11,9 +10,16 @@ from headbench.bench.errors import InputError
 from headbench.methods.official.checkout import Repository, inspect_checkout
 from headbench.methods.official.config import GAOfficialConfig
 
-from .repository import settings
-
 NAME = "ga"
+
+
+def settings(checkout, commit, **changes):
+    """Settings that find the stand-in."""
+    return GAOfficialConfig(
+        **({"checkout": str(checkout), "python": sys.executable, "commit": commit} | changes)
+    )
+
+
 REPOSITORY = Repository("https://example.org/code", "0" * 40, ("train.py", "render.py"), ("json",))
 
 
@@ -77,17 +83,6 @@ def test_a_folder_without_git_needs_an_empty_commit(repository, tmp_path):
 def test_a_command_of_several_words_is_an_interpreter(repository):
     found = inspect_checkout("ga-official", settings(*repository, python=f"env {sys.executable}"), REPOSITORY)
     assert found.python[1:] == (sys.executable,)
-
-
-def test_nothing_that_the_checkout_configures_is_run(repository, tmp_path):
-    folder, commit = repository
-    (folder / "hook.sh").write_text(f"#!/bin/sh\ntouch {tmp_path}/ran\n")
-    (folder / "hook.sh").chmod(0o755)
-    for name in ("core.fsmonitor", "diff.external"):
-        subprocess.run(["git", "-C", str(folder), "config", name, str(folder / "hook.sh")], check=True)
-    (folder / "train.py").write_text("changed")
-    inspect_checkout("ga-official", settings(folder, commit), REPOSITORY)
-    assert not (tmp_path / "ran").exists()
 
 
 def test_where_the_checkout_lies_does_not_make_another_avatar():

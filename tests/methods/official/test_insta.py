@@ -1,7 +1,6 @@
 """INSTA's adapter: the video that its program reads, where that may lie, renders on black read back by key."""
 
 import json
-import re
 from dataclasses import replace
 
 import cv2
@@ -15,78 +14,23 @@ from headbench.methods.official.config import INSTAOfficialConfig
 from headbench.methods.official.insta import export
 from headbench.methods.official.insta.export import HAIR, MOUTH, SKIN, VideoMesh
 from headbench.methods.official.insta.method import INSTAOfficial
-from headbench.methods.official.method import TRAINING_LOG
-from headbench.methods.official.workplace import Listed, check_export
+from headbench.methods.official.workplace import Listed
 from headbench.methods.shared.avatar_files import Subject
 
-from .insta_repository import make_insta_repository
-from .repository import (
-    WHITE,
-    fit,
-    rendered,
-    views,
-    with_an_odd_size,
-    workplace,
-)
+from .helpers import pixels_of, views, workplace
+from .repository import make_insta_repository
 
 NAME = "insta"
 
 
-def test_frames_are_rendered_under_their_keys_on_any_ground(avatar, official_clip, monkeypatch):
-    monkeypatch.setattr(export, "PART", 4)  # more than one call of the program
-    assert {path.name for path in avatar.files()} == {"snapshot.msgpack", "subject.npz"}
-    wanted = with_an_odd_size(views(official_clip, "self_reenactment", "novel_view", "train"))
-    subject = PosedSubject.of(official_clip)
-    for ground in (WHITE, (0.0, 0.5, 1.0)):
-        found = rendered(avatar, wanted, ground)
-        for key, (camera, pose) in wanted.items():
-            rgb = found[key].rgb
-            mesh = subject.meshes([pose_in_head_frame(pose)])[0]
-            levels = [30 + 20 * pose.expression[0], 5000 * mesh.std(), camera.K[0, 0]]
-            place = np.linalg.inv(camera.world_to_camera @ subject.motions([pose])[0])[:3, 3]
-            for pixel, shown in ((rgb[1, 1], levels), (rgb[0, 0], 75 + 60 * place)):
-                expected = np.floor(np.clip(shown, 0, 153)) / 255 + 0.4 * np.array(ground)
-                assert np.abs(pixel - expected).max() < 1.01 / 255
-            assert found[key].alpha == pytest.approx(0.6)
-
-
-def test_progress_log_and_record_are_those_of_the_program(method, repository, official_clip, tmp_path):
-    calls = []
-    fit(method, official_clip, tmp_path / "a", lambda done, total, note="": calls.append((done, note)))
-    frames = len(official_clip.splits["train"])
-    assert calls[-1][0] == frames + 20
-    assert (frames + 7, "loss 0.7") in calls
-    log = (tmp_path / "a" / TRAINING_LOG).read_text()
-    assert f"loads {frames} 1700" in log
-    assert len(re.findall(r"iteration=\d+", log)) == 20
-    record = read_json(tmp_path / "a" / "training.json")
-    assert record["official"]["commit"] == repository[1]
-    assert record["official"]["program"] == "instant-ngp 1.0dev"
-    assert record["leaks"] == []
-    assert any("8 expression coefficients" in line for line in record["differences"])
-
-
-@pytest.mark.parametrize("change", [{"python": "python"}, {"images_on_gpu": 0}])
-def test_settings_without_a_meaning_are_refused(change):
-    with pytest.raises(ValueError, match="python|images_on_gpu"):
-        INSTAOfficialConfig(**change)
-
-
-def test_words_may_start_the_program(method, repository):
-    program = f"env A=1 '{repository[0]}/build/rta'"
+def test_words_may_start_the_program(method):
+    program = f"env A=1 '{method.config.checkout}/build/rta'"
     found = INSTAOfficial(replace(method.config, program=program)).inspect()
-    assert found.python[1:] == ("A=1", f"{repository[0]}/build/rta")
+    assert found.python[1:] == ("A=1", f"{method.config.checkout}/build/rta")
 
 
-# ------------------------------------------------------------------ what the program is given
-
-
-def test_the_export_is_the_training_frames_and_a_pixel(exported, official_clip):
+def test_the_test_split_is_a_pixel_and_equal_meshes_are_written_once(exported):
     work, images = exported
-    keys = official_clip.splits["train"]
-    check_export(work, images, official_clip)
-    assert set(images.values()) == set(keys)
-    assert len(images) == 3 * len(keys)
     (last,) = read_json(work.input / "transforms_test.json")["frames"]
     assert cv2.imread(str(work.input / last["file_path"]), -1).tolist() == [[[0, 0, 0, 0]]]
     frames = read_json(work.input / "transforms_train.json")["frames"]
@@ -106,9 +50,7 @@ def test_projections_are_those_of_the_clip(exported, official_clip):
         still = subject.meshes([pose_in_head_frame(pose)])[0]
         assert np.abs(mesh - still).max() < 1e-7
         motion = subject.motions([pose])[0]
-        world = still @ motion[:3, :3].T + motion[:3, 3]
-        local = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        pixels = (local @ camera.K.T)[:, :2] / local[:, 2:]
+        pixels = pixels_of(still @ motion[:3, :3].T + motion[:3, 3], camera)
         there = np.linalg.inv(frame["transform_matrix"])
         seen = mesh @ there[:3, :3].T + there[:3, 3]
         focal, center = np.array([frame["fl_x"], frame["fl_y"]]), np.array([frame["cx"], frame["cy"]])

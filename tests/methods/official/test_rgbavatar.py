@@ -1,64 +1,27 @@
 """RGBAvatar's adapter: the video that their loader reads, the configuration of a run, renders read back by key."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
 from headbench.bench.errors import InputError
-from headbench.bench.io.documents import read_json
-from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.steps.charted import packed_chart
-from headbench.methods.official.config import RGBAvatarOfficialConfig
-from headbench.methods.official.method import TRAINING_LOG
-from headbench.methods.official.rgbavatar import method as implementation
 from headbench.methods.official.spec import RGBAVATAR_OFFICIAL
 from headbench.methods.rgbavatar.config import RGBAvatarConfig
 from headbench.methods.rgbavatar.method import RGBAvatarTraining
 
-from .repository import (
-    BUDGET,
-    check_tracked,
-    export,
-    fit,
-    read_tracked,
-    rendered,
-    views,
-    with_an_odd_size,
-)
-from .rgbavatar_repository import CONFIG, make_rgbavatar_repository
+from .helpers import BUDGET, check_tracked, export, fit, read_tracked
+from .repository import CONFIG, make_rgbavatar_repository
 
 NAME = "rgbavatar"
 
 
-def test_frames_are_rendered_under_their_keys_on_any_ground(avatar, video_clip, monkeypatch):
-    monkeypatch.setattr(implementation, "PART", 8)  # more than one call for a camera's frames
-    assert {path.name for path in avatar.files()} == {"model.ply", "config.yaml", "subject.npz"}
-    several = with_an_odd_size(views(video_clip, "self_reenactment", "novel_view", "train"))
-    for wanted, ground in ((several, (0.0, 0.5, 1.0)), (views(video_clip, "novel_view"), (1.0, 1.0, 1.0))):
-        found = rendered(avatar, wanted, ground)
-        motions = PosedSubject.of(video_clip).motions([pose for _, pose in wanted.values()])
-        for (key, (camera, pose)), motion in zip(wanted.items(), motions):
-            frame = found[key]
-            assert frame.alpha == pytest.approx(0.6)
-            shift = (camera.world_to_camera @ motion)[0, 3]
-            shown = 60 + np.array([20 * pose.expression[0], 200 * -np.sin(pose.jaw[0]), 100 * shift])
-            corner = np.array([camera.K[0, 0], camera.K[0, 2], 255])  # 300 is not 300 - 256
-            for pixel, levels in ((frame.rgb[1, 1], np.clip(shown, 0, 153)), (frame.rgb[0, 0], corner)):
-                expected = np.clip(np.floor(levels) / 255 + 0.4 * np.array(ground), 0, 1)
-                assert np.abs(pixel - expected).max() < 1.01 / 255
-
-
-def test_the_published_configuration_is_scaled_to_the_run(method, repository, video_clip, tmp_path):
-    calls = []
-    fit(method, video_clip, tmp_path / "a", lambda done, total, note="": calls.append(done))
-    frames = len(video_clip.splits["train"])
-    assert calls[-1] == frames + 20
-    assert frames + 7 in calls, "steps of ten images"
-    log = (tmp_path / "a" / TRAINING_LOG).read_text()
-    assert "train_offline.py --subject head --work_name headbench" in log
-    found = yaml.safe_load((tmp_path / "a" / "config.yaml").read_text())
+def test_the_published_configuration_is_scaled_to_the_run(trained):
+    folder, _ = trained(NAME)
+    found = yaml.safe_load((folder / "config.yaml").read_text())
     assert (found["data_dir"], found["output_dir"]) == ("../input", "../model")
     assert (found["train"].pop("iteration"), found["train"].pop("batch_size")) == (200, 10)
     assert found["train"]["recon"].pop("blend_start_iter") == 10
@@ -69,10 +32,6 @@ def test_the_published_configuration_is_scaled_to_the_run(method, repository, vi
     for name in ("blend_start_iter", "position_lr_max_steps"):
         del published["train"]["recon"][name]
     assert {**found, "data_dir": "", "output_dir": ""} == {**published, "data_dir": "", "output_dir": ""}
-    record = read_json(tmp_path / "a" / "training.json")
-    assert record["official"]["commit"] == repository[1]
-    assert record["leaks"] == []
-    assert any("8 directions is padded" in line for line in record["differences"])
 
 
 def test_a_run_of_the_published_length_has_published_values(method, video_clip, tmp_path):
@@ -93,28 +52,28 @@ def test_frames_hold_pose_and_camera_in_the_heads_frame(exported, video_clip):
         assert check_tracked(found, video_clip, key) < 1e-3
 
 
-def test_the_texture_chart_is_theirs(exported, repository):
+def test_the_texture_chart_is_theirs(exported, method):
     work, _ = exported
     name = "data/FLAME2020/flame_uv.npz"
-    assert (work.program / name).read_bytes() == (repository[0] / name).read_bytes()
+    assert (work.program / name).read_bytes() == (Path(method.config.checkout) / name).read_bytes()
 
 
 @pytest.mark.parametrize(
     ("more", "expected"),
     {(1, 0): "l_eyelid.npy has.*Refit the capture to FLAME 2020", (0, 1): "flame_uv.npz has"}.items(),
 )
-def test_another_topology_than_flames_is_refused(method, repository, video_clip, more, expected):
+def test_another_topology_than_flames_is_refused(method, tmp_path, video_clip, more, expected):
     sizes = len(video_clip.head.template) + more[0], len(video_clip.head.faces) + more[1]
-    folder = repository[0].with_name("other")
+    folder = tmp_path / "other"
     commit = make_rgbavatar_repository(folder, *sizes)
     method.config = replace(method.config, checkout=str(folder), commit=commit)
     with pytest.raises(InputError, match=expected):
         method.check(video_clip, BUDGET)
 
 
-def test_another_topology_has_its_chart_with_the_shim(method, repository, video_clip, tmp_path):
+def test_another_topology_has_its_chart_with_the_shim(method, video_clip, tmp_path):
     """Its own chart, with the texels and the initial size of the native method; without a chart it is refused."""
-    folder = repository[0].with_name("other")
+    folder = tmp_path / "other"
     commit = make_rgbavatar_repository(folder, len(video_clip.head.template) + 1, len(video_clip.head.faces))
     values = {"checkout": str(folder), "commit": commit, "device": "cpu-shim", "samples": 500}
     method.config = replace(method.config, **values, motion="root", values=("position_lr_final=0.1",))
@@ -156,9 +115,3 @@ def test_a_configuration_of_another_form_is_refused(method, repository, video_cl
     path.write_text(CONFIG.replace("blend_start_iter", "blend_from"))
     with pytest.raises(InputError, match="blend_start_iter: expected one entry, found 0"):
         fit(method, video_clip, tmp_path / "a")
-
-
-@pytest.mark.parametrize("value", ["tex_size", "iteration=5", "tex_size=9"])
-def test_entries_that_the_adapter_writes_cannot_be_given(value):
-    with pytest.raises(ValueError, match="values must be NAME=VALUE of other entries than data_dir"):
-        RGBAvatarOfficialConfig(values=(value,))

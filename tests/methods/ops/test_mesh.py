@@ -44,7 +44,7 @@ def test_frames_follow_the_definition():
         np.testing.assert_allclose(Rotation.from_quat(quaternion).as_matrix(), rotation, atol=1e-12)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     st.integers(0, 10**6),
     st.lists(st.floats(-3, 3), min_size=3, max_size=3),

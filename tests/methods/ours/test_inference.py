@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
 from headbench.methods.ops.planes import Bounds, line_offsets
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.ours.field import blend_lines, line_table, normalised_weight, offset_layers
 from headbench.methods.ours.inference import LineOffsets
-from headbench.methods.shared.subject_mesh import KnownPoses, pose_key
+from headbench.methods.shared.subject_mesh import pose_key
 
 from ..toy_clip import first_view
 from .toy import CASES, store
@@ -42,19 +41,16 @@ def test_offsets_are_those_of_training(clip, tmp_path):
 
 @pytest.mark.parametrize("case", CASES)
 def test_frames_do_not_depend_on_what_was_drawn_before(case, clip, tmp_path):
-    """Any walk over poses and cameras, prepared or not, gives each frame bit for bit as a fresh avatar does."""
+    """Any walk over poses and cameras gives each frame bit for bit as a fresh avatar does."""
     folder = store(clip, tmp_path, CASES[case])
     avatar = OursAvatar.read(folder, "cpu")
     cameras, poses = list(clip.cameras.values()), list(clip.poses.values())
     walk = [(0, 0), (1, 0), (1, 0), (1, 1), (0, 1), (0, 0), (2, 3), (2, 2)]
     fresh = {step: OursAvatar.read(folder, "cpu").render(cameras[step[0]], poses[step[1]]) for step in walk}
-    for prepared in (False, True):
-        if prepared:
-            assert avatar.prepare(poses[:2]) == 2
-        for step in walk:
-            found = avatar.render(cameras[step[0]], poses[step[1]])
-            np.testing.assert_array_equal(found.rgb, fresh[step].rgb)
-            np.testing.assert_array_equal(found.alpha, fresh[step].alpha)
+    for step in walk:
+        found = avatar.render(cameras[step[0]], poses[step[1]])
+        np.testing.assert_array_equal(found.rgb, fresh[step].rgb)
+        np.testing.assert_array_equal(found.alpha, fresh[step].alpha)
 
 
 def test_colours_are_kept_for_the_same_pose_and_place_alone(clip, tmp_path, monkeypatch):
@@ -85,7 +81,6 @@ def test_a_pose_is_known_by_its_numbers_and_not_by_its_timestep(clip, tmp_path):
     avatar = OursAvatar.read(store(clip, tmp_path), "cpu")
     pose = clip.poses[0]
     camera = next(iter(clip.cameras.values()))
-    avatar.prepare([pose])
     first = avatar.render(camera, pose).rgb
     for name in ("expression", "jaw", "rotation", "neck", "eyes", "translation"):
         other = replace(pose, **{name: np.asarray(getattr(pose, name)) + np.float32(0.02)})
@@ -96,32 +91,3 @@ def test_a_pose_is_known_by_its_numbers_and_not_by_its_timestep(clip, tmp_path):
         avatar.render(camera, replace(pose, head_model="another"))
     assert pose_key(replace(pose, eyelids=np.zeros(2))) != pose_key(pose)
     assert pose_key(replace(pose, subject="b", timestep=99)) == pose_key(pose)
-
-
-def test_no_more_poses_are_prepared_than_fit(clip, tmp_path):
-    avatar = OursAvatar.read(store(clip, tmp_path), "cpu")
-    poses = list(clip.poses.values())
-    counts = [avatar.prepare(poses, megabytes=size) for size in (0, 0.13, 0.25, 100)]
-    assert counts[0] == 0
-    assert 0 < counts[1] < counts[2] <= counts[3] == len(poses)
-
-
-def test_known_values_are_bounded_and_computed_once():
-    class Value:
-        bytes = 10
-
-    computed = []
-
-    def compute(pose):
-        computed.append(pose)
-        return Value()
-
-    poses = [HeadPose("m", *[np.array([number])] * 6) for number in range(5)]
-    known = KnownPoses(compute, 35)
-    assert known.prepare([poses[0], poses[0], *poses[1:]]) == 4
-    assert len(computed) == 4
-    assert known(poses[1]) is known(poses[1])
-    assert len(computed) == 4
-    known(poses[4])
-    known(poses[4])
-    assert len(computed) == 6

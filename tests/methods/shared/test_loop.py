@@ -109,7 +109,7 @@ def test_seconds_alone_give_an_estimate_of_iterations(tmp_path):
     assert model.optimiser["x"].item() == pytest.approx(-0.5 * (outcome.planned - 1))
 
 
-@pytest.mark.parametrize("late", [0.5, 1.0, 1.6, 2.0])
+@pytest.mark.parametrize("late", [0.5, 2.0])
 def test_seconds_are_used_although_the_first_steps_mislead(tmp_path, late):
     clock = Clock()
 

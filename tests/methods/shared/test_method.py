@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from headbench.bench.contracts import PreparedMethod
 from headbench.methods.ga.method import GA
 from headbench.methods.shared import method as shared
@@ -30,6 +32,7 @@ def test_optimisers_are_loaded_before_a_training_and_not_to_draw(monkeypatch):
     assert loaded == [True]
 
 
+@pytest.mark.slow
 def test_the_first_step_of_a_process_imports_next_to_nothing():
     said = subprocess.run([sys.executable, "-c", FIRST_STEP], capture_output=True, text=True, check=True)
     assert int(said.stdout) < 20  # several hundred without

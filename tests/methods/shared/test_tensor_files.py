@@ -1,50 +1,24 @@
 """Tensors of safetensors files: what is no such file, or holds what no avatar can, is refused."""
 
-from __future__ import annotations
-
-import json
-import struct
-
 import pytest
 import torch
 from safetensors.torch import save
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.arrays import Member
-from headbench.methods.shared.tensor_files import MAX_HEADER, check_sizes, check_tensors, read_safetensors
+from headbench.methods.shared.tensor_files import check_sizes, check_tensors, read_safetensors
 
-from ...memory import memory_below
-
-
-def file_of(header: object, data: bytes = b"") -> bytes:
-    text = json.dumps(header).encode() if not isinstance(header, bytes) else header
-    return struct.pack("<Q", len(text)) + text + data
+WHOLE = save({"x": torch.zeros(100)})
 
 
-def entry(dtype: str, shape: list, end: int) -> dict:
-    return {"x": {"dtype": dtype, "shape": shape, "data_offsets": [0, end]}}
-
-
-DAMAGED = {
-    "too long": save({"x": torch.zeros(100)}) + b"\0",
-    "a header as long as the world": struct.pack("<Q", 2**62) + b"{}",
-    "a header of more than its share": file_of(b" " * (MAX_HEADER + 1)),
-    "another size": file_of(entry("F32", [3], 4), bytes(4)),
-    "huge": file_of(entry("F32", [2**40], 2**42)),
-    "huge and empty": file_of(entry("F32", [0, 2**62], 0)),
-    "an unknown type": file_of(entry("F33", [1], 4), bytes(4)),
-    "no type": file_of({"x": 1}),
-    "nested": file_of(b"[" * 100_000),
-}
-
-
-@pytest.mark.parametrize("name", DAMAGED)
-def test_a_damaged_file_is_refused(tmp_path, name):
+@pytest.mark.parametrize("content", [WHOLE + b"\0", WHOLE[:-1], WHOLE[:40], b"", b"text"])
+def test_a_damaged_file_is_refused(tmp_path, content):
     path = tmp_path / "x.safetensors"
-    path.write_bytes(DAMAGED[name])
-    with pytest.raises(InputError) as caught, memory_below(2**20):
-        read_safetensors(path)
-    assert caught.value.file == str(path)
+    path.write_bytes(content)
+    for wrong in (path, tmp_path / "none"):
+        with pytest.raises(InputError) as caught:
+            read_safetensors(wrong)
+        assert caught.value.file == str(wrong)
 
 
 def test_tensors_are_checked_as_arrays_are(tmp_path):

@@ -22,21 +22,6 @@ COMPILED_CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)  # by gsplat 1.5 and 1.6 a
 needs_gpu = pytest.mark.skipif(not cuda.installed(), reason="needs a GPU and gsplat (extra `cuda`)")
 
 
-class _AbsoluteGradients(torch.autograd.Function):
-    """Leaves ``absgrad`` on the 2D means in the backward pass, and not before, as gsplat 1.5 does."""
-
-    @staticmethod
-    def forward(ctx, image, means2d):
-        ctx.save_for_backward(means2d)
-        return image.view_as(image)
-
-    @staticmethod
-    def backward(ctx, gradient):
-        (means2d,) = ctx.saved_tensors
-        means2d.absgrad = torch.full_like(means2d, 3.0)
-        return gradient, None
-
-
 class FakeGsplat:
     """gsplat's functions in plain torch on the CPU, of any dtype; draws every splat at every pixel.
 
@@ -87,7 +72,7 @@ class FakeGsplat:
         return torch.zeros(views, rows, columns, dtype=torch.int32)
 
     def rasterize_to_pixels(
-        self, means2d, conics, colors, opacities, width, height, tile, offsets, lists, *, backgrounds, absgrad
+        self, means2d, conics, colors, opacities, width, height, tile, offsets, lists, *, backgrounds
     ):
         assert offsets.shape[1:] == (-(-height // tile), -(-width // tile))
         assert colors.shape[-1] in COMPILED_CHANNELS
@@ -110,8 +95,7 @@ class FakeGsplat:
                 light = light * (1 - alpha)
             images.append(image + light[..., None] * backgrounds[view])
             alphas.append(1 - light[..., None])
-        image = torch.stack(images)
-        return _AbsoluteGradients.apply(image, means2d) if absgrad else image, torch.stack(alphas)
+        return torch.stack(images), torch.stack(alphas)
 
 
 class NewGsplat(FakeGsplat):
@@ -126,7 +110,7 @@ class NewGsplat(FakeGsplat):
 @pytest.mark.parametrize("gsplat", [FakeGsplat(), NewGsplat()])
 @pytest.mark.parametrize(("antialiased", "channels"), [(False, 3), (True, 3), (False, 7)])
 def test_gsplat_is_driven_to_draw_what_the_reference_draws(antialiased, channels, gsplat):
-    one, other = (cloud(25, 19, 14, seed=seed, size=0.1, channels=channels) for seed in (1, 2))
+    one = cloud(25, 19, 14, seed=1, size=0.1, channels=channels)
     one.means[:4] = torch.tensor(
         [[0.1, 0.2, -5.0], [0, 0, 2e3], [0.3, 0, 2e3], [0.1, 0.0, -9.0]]
     )  # not in view
@@ -141,11 +125,9 @@ def test_gsplat_is_driven_to_draw_what_the_reference_draws(antialiased, channels
     }
 
     def outcome(render):
-        leaves = [value.double().requires_grad_() for value in one[:5]]
-        leaves.append(torch.stack([one.viewmat, other.viewmat]).double().requires_grad_())
-        leaves.append(torch.zeros(2, 25, 2, dtype=torch.float64, requires_grad=True))
-        Ks = torch.stack([one.K, other.K])
-        result = render(*leaves[:6], Ks, 19, 14, means2d_offset=leaves[6], **options)
+        leaves = [value.double().requires_grad_() for value in one[:6]]
+        leaves.append(torch.zeros(25, 2, dtype=torch.float64, requires_grad=True))
+        result = render(*leaves[:6], one.K, 19, 14, means2d_offset=leaves[6], **options)
         rng = torch.Generator().manual_seed(0)
         upstream = torch.randn(result.image.shape, generator=rng).double()
         return result, torch.autograd.grad((result.image, result.alpha), leaves, (upstream, upstream[..., 0]))
@@ -153,20 +135,11 @@ def test_gsplat_is_driven_to_draw_what_the_reference_draws(antialiased, channels
     result, gradients = outcome(lambda *a, **o: cuda.draw(gsplat, request_of(*a, **o)))
     truth, true_gradients = outcome(partial(rasterize, backend="reference"))
     assert torch.equal(result.radii, truth.radii), "not gsplat's own, which opacity changes"
-    assert (result.radii[0] == 0).sum() >= 4, "rows that are not valid were met"
+    assert (result.radii == 0).sum() >= 4, "rows that are not valid were met"
     torch.testing.assert_close(result.image, truth.image)
     torch.testing.assert_close(result.alpha, truth.alpha)
     for name, value, wanted in zip(names, gradients, true_gradients, strict=True):
         assert relative_error(value, wanted) < 1e-6, name
-
-
-def test_absolute_gradients_are_taken_from_gsplat():
-    offset, absolute = (torch.zeros(6, 2, requires_grad=True) for _ in range(2))
-    scene = cloud(6, 8, 8, seed=3, size=0.1)
-    request = request_of(*scene[:9], means2d_offset=offset, means2d_abs=absolute)
-    cuda.draw(FakeGsplat(), request).image.sum().backward()
-    assert absolute.grad is not None
-    assert (absolute.grad == 3).all()
 
 
 EXTENSIONS = {
@@ -290,8 +263,8 @@ def test_gsplat_agrees_with_the_reference_on_a_gpu(antialiased):
 
     def outcome(device, dtype, backend):
         leaves = [value.to(device, dtype).requires_grad_() for value in scene[:6]]
-        leaves += [torch.zeros(3000, 2, device=device, dtype=dtype, requires_grad=True) for _ in range(2)]
-        options = {"means2d_offset": leaves[6], "means2d_abs": leaves[7], "antialiased": antialiased}
+        leaves.append(torch.zeros(3000, 2, device=device, dtype=dtype, requires_grad=True))
+        options = {"means2d_offset": leaves[6], "antialiased": antialiased}
         view = scene.K, 120, 100
         image = rasterize(*leaves[:6], *view, background=scene.background, backend=backend, **options).image
         image.backward(upstream.to(device, dtype))

@@ -10,11 +10,8 @@ import torch
 from headbench.bench.errors import UnavailableError
 from headbench.bench.native.loader import Kernel
 from headbench.methods.benchmarks.scenes import (
-    DIFFERENTIABLE,
     SplatScene,
     cloud,
-    relative_error,
-    render_with_gradients,
 )
 from headbench.methods.splats import available_backends, cpu, rasterize
 
@@ -28,27 +25,22 @@ BAD = [
     ("opacities", torch.zeros(5, 1), r"opacities: expected shape \(5,\)"),
     ("opacities", [0.0] * 5, "opacities: .*torch tensor.*list"),
     ("colors", torch.zeros(5), "colors"),
+    ("colors", torch.zeros(2, 5, 3), "colors"),
+    ("viewmat", torch.eye(4).expand(2, 4, 4), "viewmat"),
     ("colors", torch.zeros(5, 33), "colors: .*1 to 32"),
     ("colors", torch.zeros(5, 0), "colors"),
-    ("colors", torch.zeros(2, 5, 3), "colors: .*V cameras"),
     ("viewmat", torch.eye(3), r"viewmat: expected shape \(4, 4\)"),
-    ("viewmat", torch.zeros(0, 4, 4), "viewmat: expected at least one camera"),
-    ("viewmat", torch.eye(4).expand(2, 4, 4), "viewmat, K: .*2 and 3"),
     ("K", torch.eye(4), r"K: expected shape \(3, 3\)"),
     ("width", 0, "width: expected a positive integer"),
     ("width", 10.0, "width: expected a positive integer"),
     ("height", -3, "height: expected a positive integer"),
     ("background", torch.zeros(2, 3), r"background: expected shape \(3,\)"),
-    ("background", torch.zeros(3, 3), r"background: expected shape \(2, 3\)"),
 ]
-TWO = torch.eye(4).expand(2, 4, 4)
 
 
 @pytest.mark.parametrize(("name", "value", "message"), BAD)
 def test_wrong_arguments_are_named(name, value, message):
-    more = {"K": torch.eye(3).expand(3, 3, 3)} if "2 and 3" in message else {}
-    more |= {"viewmat": TWO} if "(2, 3" in message else {}
-    scene = cloud(5, 8, 8)._replace(**{**more, name: value})
+    scene = cloud(5, 8, 8)._replace(**{name: value})
     with pytest.raises(ValueError, match=message):
         rasterize(*scene[:9], background=scene.background)
 
@@ -178,46 +170,3 @@ def test_without_the_kernel_the_reference_draws_and_warns_once(caplog, without_k
     assert message.endswith(without_kernel.remedy)
     with pytest.raises(UnavailableError, match="no_such_kernel.*compiler"):
         rasterize(*scene[:9], backend="cpu")
-
-
-@backends
-@pytest.mark.parametrize("own_colors", [False, True])
-def test_several_cameras_in_one_call_are_as_many_calls(backend, own_colors):
-    scene = cloud(60, 33, 27, seed=5, size=0.1)
-    other = cloud(60, 33, 27, seed=6)
-    colors = torch.stack([scene.colors, other.colors]) if own_colors else scene.colors
-    batch = scene._replace(
-        colors=colors,
-        viewmat=torch.stack([scene.viewmat, other.viewmat]),
-        K=torch.stack([scene.K, scene.K + torch.tensor([[3.0, 0, 1], [0, -2, 2], [0, 0, 0]])]),
-        background=torch.stack([scene.background, other.background]),
-    )
-    together = render_with_gradients(batch, torch.float32, backend=backend, seed=1)
-    assert together.rendering.image.shape == (2, 27, 33, 3)
-    assert together.rendering.radii.shape == (2, 60)
-    leaves = [value.clone().requires_grad_() for value in batch[:7]]
-    backgrounds = batch.background.clone().requires_grad_()
-    offsets, absolutes = (torch.zeros(2, 60, 2, requires_grad=True) for _ in range(2))
-    rng = torch.Generator().manual_seed(1)
-    on_image, on_alpha = torch.randn(2, 27, 33, 3, generator=rng), torch.randn(2, 27, 33, generator=rng)
-    for view in range(2):
-        *splats, colors, viewmats, Ks = leaves
-        single = rasterize(
-            *(*splats, colors[view] if own_colors else colors, viewmats[view], Ks[view], 33, 27),
-            background=backgrounds[view],
-            means2d_offset=offsets[view],
-            means2d_abs=absolutes[view],
-            backend=backend,
-        )
-        for field in ("image", "alpha", "radii"):
-            assert torch.equal(getattr(single, field), getattr(together.rendering, field)[view])
-        torch.autograd.backward((single.image, single.alpha), (on_image[view], on_alpha[view]))
-    for name, leaf in zip(DIFFERENTIABLE, [*leaves, backgrounds, offsets, absolutes], strict=True):
-        assert relative_error(together.gradients[name], leaf.grad) < 1e-6, name
-
-
-def test_one_camera_in_a_batch_keeps_its_dimension():
-    scene = cloud(20, 9, 8)
-    result = rasterize(*scene[:6], scene.K[None], 9, 8, background=scene.background)
-    assert result.image.shape == (1, 8, 9, 3)
-    assert torch.equal(result.image[0], rasterize(*scene[:9], background=scene.background).image)

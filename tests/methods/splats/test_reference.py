@@ -68,29 +68,6 @@ def test_antialiasing_fades_a_splat_by_the_area_the_filter_adds():
     assert result.alpha[10, 10].item() == pytest.approx(opacity * sharp / (sharp + 0.3), abs=1e-14)
 
 
-def test_absolute_gradients_are_sums_over_pixels():
-    scene = cloud(9, 7, 6, seed=2, size=0.2)
-    inputs = [value.double() for value in scene[:5]]
-    upstream = torch.randn(6, 7, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
-
-    def gradients(upstream):
-        offset, absolute = (torch.zeros(9, 2, dtype=F64, requires_grad=True) for _ in range(2))
-        image = rasterize(
-            *inputs, *scene[5:9], background=scene.background, means2d_offset=offset, means2d_abs=absolute
-        ).image
-        image.backward(upstream)
-        return offset.grad, absolute.grad
-
-    wanted = torch.zeros(9, 2, dtype=F64)
-    for row in range(6):
-        for column in range(7):
-            one_pixel = torch.zeros_like(upstream)
-            one_pixel[row, column] = upstream[row, column]
-            wanted += gradients(one_pixel)[0].abs()
-    assert wanted.max() > 0
-    torch.testing.assert_close(gradients(upstream)[1], wanted)
-
-
 def test_nearer_splat_covers_the_farther_whatever_their_order():
     near_first = on_axis([2.0, 3.0], [0.1, 0.1], [0.6, 0.5], [[1.0, 0.0], [0.0, 1.0]])
     far_first = on_axis([3.0, 2.0], [0.1, 0.1], [0.5, 0.6], [[0.0, 1.0], [1.0, 0.0]])
@@ -138,7 +115,7 @@ def test_agrees_with_brute_force(seed):
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradients_agree_with_finite_differences(antialiased):
     # Faint wide splats: every one reaches every pixel, so no threshold makes the image jump.
-    scene = cloud(6, 5, 4, seed=3, size=0.4, opacity=-1.0)
+    scene = cloud(4, 4, 3, seed=3, size=0.4, opacity=-1.0)
     scene = scene._replace(
         means=scene.means * torch.tensor([0.2, 0.2, 0.1]) + torch.tensor([0.0, 0.0, 1.5]),
         opacities=scene.opacities.clamp(0.2, 0.5),
@@ -152,8 +129,8 @@ def test_gradients_agree_with_finite_differences(antialiased):
         result = rasterize(*geometry, scene.width, scene.height, **options)
         return result.image, result.alpha
 
-    assert len(leaves) == len(DIFFERENTIABLE) - 1, "all but means2d_abs, which is no derivative"
-    assert torch.autograd.gradcheck(render, leaves, eps=1e-6, atol=1e-6)
+    assert len(leaves) == len(DIFFERENTIABLE)
+    assert torch.autograd.gradcheck(render, leaves, eps=1e-6, atol=1e-6, check_undefined_grad=False)
 
 
 def test_gradients_where_slopes_are_clamped():

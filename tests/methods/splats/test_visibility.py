@@ -96,26 +96,3 @@ def test_opacity_does_not_change_radii(backend, antialiased):
     assert not drawn[0].alpha.any()
     assert torch.equal(drawn[0].radii, drawn[1].radii)
     assert torch.equal(drawn[0].radii, drawn[2].radii)
-
-
-def test_splats_that_are_masked_are_out_of_view():
-    scene = crowd()
-    inside = int((rasterize(*scene[:9]).radii > 0).nonzero()[0])
-    scene.colors[inside] = float("nan")
-    # The camera is behind the origin, which is where a masked splat is put.
-    scene = scene._replace(viewmat=torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]))
-    assert rasterize(*scene[:9], mask_non_finite=True).radii[inside] == 0
-
-
-def test_radii_of_several_cameras_have_a_leading_dimension():
-    scene = crowd()
-    viewmats = torch.stack([scene.viewmat, scene.viewmat])
-    viewmats[1, 0, 3] = 0.3
-
-    def radii(viewmat):
-        request = request_of(*scene._replace(viewmat=viewmat)[:9], near=0.2)
-        return cuda.draw(FakeGsplat(), request).radii
-
-    one, two = map(radii, viewmats)
-    assert torch.equal(radii(viewmats), torch.stack([one, two]))
-    assert not torch.equal(one, two)

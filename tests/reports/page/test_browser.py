@@ -1,7 +1,6 @@
 """The page in Chromium, opened from the disk."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -13,16 +12,32 @@ from headbench.reports.page.settings import PageSettings
 
 from .test_page import HOSTILE
 
+pytestmark = pytest.mark.commands
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The page of a run, by the names of both; written once."""
+    folder, pages = tmp_path_factory.mktemp("pages"), {}
+
+    def written(run, split):
+        name = f"{run.name}-apart" if split else f"{run.name}.html"
+        if name not in pages:
+            write_report(PageSettings((str(run),), str(folder / name), split=split, trust=True))
+            pages[name] = folder / name / "index.html" if split else folder / name
+        return pages[name]
+
+    return written
+
 
 @pytest.fixture
-def opened(new_tab, tmp_path):
+def opened(new_tab, written):
     """Open the page of a run at a width; afterwards there was no message, no dialog and no request but for the file."""
-    faults, requests = new_tab.faults, []
+    faults, requests, own = new_tab.faults, [], []
 
     def start(run, width=1200, scheme="light", split=False, address="", **options):
-        out = tmp_path / "page.html"
-        write_report(PageSettings((str(run),), str(out), split=split, trust=True))
-        out = out / "index.html" if split else out
+        out = written(run, split)
+        own.append(out.as_uri().removesuffix("index.html"))
         tab = new_tab(width, 800, color_scheme=scheme, **options)
         tab.on("console", lambda message: faults.append(message.text))
         tab.on("dialog", lambda dialog: faults.append(dialog.message))
@@ -31,10 +46,7 @@ def opened(new_tab, tmp_path):
         return tab
 
     yield start
-    beside = {url for url in requests if "/page.html/pictures/" in url and url.startswith("file:")}
-    assert {
-        Path(url.partition("#")[0]).name for url in {*requests} - beside if not url.startswith("data:")
-    } <= {*("page.html", "index.html")}
+    assert [url for url in requests if not url.startswith(("data:", *own))] == []
 
 
 def pixels(tab, name):
@@ -192,10 +204,9 @@ def test_a_view_opens_again_by_its_address(opened, toy_run):
     assert again.evaluate("state.zoom") == 1.5
 
 
-def test_pictures_apart_are_loaded_when_they_are_shown(opened, toy_run, tmp_path, monkeypatch):
+def test_pictures_apart_are_loaded_when_they_are_shown(opened, toy_run, monkeypatch):
     monkeypatch.setattr(split, "FILE_BYTES", 300)
     expected = pixels(opened(toy_run), "toy")
-    (tmp_path / "page.html").unlink()
     tab = opened(toy_run, split=True)
     assert pixels(tab, "toy") == expected
     tab.keyboard.press("e")

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
 
+from headbench.bench.condition import PLAIN, Condition, Named
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.io.files import to_jsonable
@@ -49,7 +50,10 @@ def make_run(tmp_path, write_manifest):
                     rows.append(Row(*frame[:-1], "face", "psnr", psnr - 10.0, protocol))
             avatar = (method, "1", 0, "", "s", "", -1, "", "full")
             rows += [Row(*avatar, "storage", size, ""), Row(*avatar, "fps", fps, "")]
-        Rows.of(rows).write(folder.rows)
+        named = [(each, each.method.partition("+")) for each in rows]
+        Rows.of(
+            replace(each, method=name, condition=condition) for each, (name, _, condition) in named
+        ).write(folder.rows)
         write_manifest(folder, METRICS, dict.fromkeys(methods), {"novel_view": protocol}, trivial=("floor",))
         return str(folder.root)
 
@@ -84,13 +88,7 @@ def test_points_of_several_runs_and_which_are_on_the_front(make_run, tmp_path):
     assert found.passed
 
 
-def test_the_published_result_has_its_points(tmp_path):
-    gallery = Path(__file__).parents[3] / "reports" / "gallery"
-    points = pareto_runs(ParetoSettings((str(gallery),), str(tmp_path / "out"))).data["points"]
-    assert len(points) == 12  # six methods and their coded avatars; its rows are of two regions
-    assert all(point["megabytes"] and point["milliseconds"] for point in points)
-
-
+@pytest.mark.usefixtures("no_plots")
 def test_a_metric_where_less_is_better_turns_the_front_round(make_run, tmp_path):
     folder = make_run(
         "r", ours=(28.0, 0.10, 1.0, 200.0), ga=(27.0, 0.05, 2.0, 400.0), gbs=(30.0, 0.2, 3.0, 9.0)
@@ -100,6 +98,7 @@ def test_a_metric_where_less_is_better_turns_the_front_round(make_run, tmp_path)
     assert marks == {"ours": "1", "ga": "1", "gbs": "0"}
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_what_does_not_compare_or_is_not_there_is_refused(make_run, tmp_path):
     one = make_run("one", ours=(28.0, 0.1, 1.0, 200.0))
     other = make_run("other", protocol="p2", ours=(28.0, 0.1, 1.0, 200.0))
@@ -114,6 +113,7 @@ def test_what_does_not_compare_or_is_not_there_is_refused(make_run, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_frame_time_is_the_named_metric_or_else_the_median(make_run, tmp_path):
     folder = make_run("r", ours=(28.0, 0.1, 1.0, 200.0))
     manifest, rows = RunFolder(tmp_path / "r").manifest, RunFolder(tmp_path / "r").rows
@@ -128,8 +128,8 @@ def test_frame_time_is_the_named_metric_or_else_the_median(make_run, tmp_path):
         assert float(table(tmp_path / "out")[0]["milliseconds"]) == expected
 
 
-@pytest.mark.parametrize("time", ["", "latency_p50"])
-@pytest.mark.parametrize("several", [False, True])
+@pytest.mark.usefixtures("no_plots")
+@pytest.mark.parametrize(("time", "several"), [("", False), ("latency_p50", True)])
 def test_frame_times_that_do_not_compare_have_a_note(make_run, tmp_path, change_manifest, time, several):
     methods = {"ours": (28.0, 0.1, 1.0, 200.0), "ga": (27.0, 0.1, 1.0, 9.0), "floor": (9.0, 0.9, 1.0, 9.0)}
     folders = [make_run(name, **methods) for name in ("r", "other")[: 1 + several]]
@@ -152,18 +152,13 @@ def test_frame_times_that_do_not_compare_have_a_note(make_run, tmp_path, change_
     assert f"Frame times: {note}" in found.text.splitlines()
 
 
-def test_derived_avatars_are_told_from_trained_ones(make_run, tmp_path, change_manifest):
+@pytest.mark.usefixtures("no_plots")
+def test_derived_avatars_are_told_from_trained_ones(make_run, tmp_path):
     folder = make_run("r", **{"ga": (28.0, 0.1, 4.0, 100.0), "ga+half": (27.9, 0.1, 2.0, 100.0)})
-    derived = {"from": "ga", "variant": "half", "change": "16-bit floats"}
-
-    def as_version_1(manifest):
-        for method in manifest["methods"]:
-            if method["name"] == "ga" and method.pop("condition", ""):
-                method |= {"name": "ga+half", "derived": derived}
-        manifest |= {"format": 1, "sweep_of": "somewhere"}
-        del manifest["configuration"]["conditions"]
-
-    change_manifest(Path(folder), as_version_1)
+    manifest = RunFolder(Path(folder)).read_manifest()
+    conditions = (PLAIN, Condition("half", derive=Named("variant", {"name": "half"})))
+    configuration = replace(manifest.configuration, conditions=conditions)
+    replace(manifest, configuration=configuration).write(RunFolder(Path(folder)).manifest)
     text = pareto_runs(ParetoSettings((folder,), str(tmp_path / "out"))).text
     assert "derived from the trained avatar" in text
     trained, derived = table(tmp_path / "out")

@@ -17,7 +17,7 @@ from headbench.reports.statistics.primary import MARGINS, PAIR, PRIMARY, primary
 from ..conftest import LPIPS, PSNR
 from ..made_rows import row
 
-PAGE = Path(__file__).parents[3] / "docs" / "explanation" / "statistics.md"
+PAGE = Path(__file__).parents[3] / "docs" / "explanation" / "suite.md"
 TASKS = tuple(dict.fromkeys(task for task, _ in PRIMARY))
 
 

@@ -9,7 +9,7 @@ import pytest
 from headbench.bench.engine.store import RunFolder
 from headbench.reports.runs import RunSet
 from headbench.reports.suite.suite import CROSSED, ENDPOINTS, LARGE, suite_report
-from headbench.reports.suite.tracked import condition_table, drop_table, drops_by_tracking
+from headbench.reports.suite.tracked import condition_table, drop_table
 from headbench.reports.table_report import table_of
 
 PSNR = {
@@ -46,15 +46,6 @@ def test_the_drop_is_novel_view_minus_self_reenactment(tracked_run):
     assert {row.method: row.cells[-1].value for row in table.rows} == pytest.approx(DROP)
     assert {row.method: float(row.cells[-1].text) for row in table.rows} == pytest.approx(DROP, abs=1e-4)
     assert {row.method: row.cells[0].value for row in table.rows} == {name: PSNR[name] for name in DROP}
-
-
-def test_drops_by_tracking_are_means_of_shared_subjects(tracked_run):
-    text = drops_by_tracking(RunSet.read([tracked_run]), {"": "exact", "tracked": "tracked"})
-    assert text.startswith("Subjects a, b, c, d, means")
-    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| Self")]
-    assert [title.partition(", ")[2] for title, *_ in rows] == ["exact", "tracked"]
-    found = [[float(value.partition(" (")[0]) for value in values] for _, *values in rows]
-    assert found == [[DROP["ga"], DROP["ours"]], [DROP["ga+tracked"], DROP["ours+tracked"]]]
 
 
 def test_a_drop_is_missing_where_a_task_has_no_values(tracked_run):
@@ -123,14 +114,12 @@ def test_an_interrupted_training_has_the_processor_of_others(tracked_run):
     assert "Trained on: one kind: subjects a, b, c; unknown processors: subjects d." in text
 
 
-def test_a_second_run_has_its_own_heading(tracked_run, write_run):
-    alone = suite_report(tracked_run.parent, "ours")
-    write_run("suite/run-large/01", {"ga": 30.0, "ours": 31.0})
-    first, second = suite_report(tracked_run.parent, "ours").split(f"\n# {LARGE}\n")
-    assert first == alone
-    write_run("other/run/01", {"ga": 30.0, "ours": 31.0})
-    primary, own = suite_report(tracked_run.parents[1] / "other", "ours").split("\n\n## All frames")
+def test_large_images_have_their_own_heading_and_no_primary_endpoints(write_run):
+    for name in ("run", "run-large"):
+        folder = write_run(f"suite/{name}/01", {"ga": 30.0, "ours": 31.0})
+    first, large = suite_report(folder.parents[1], "ours").split(f"\n# {LARGE}\n")
+    primary, usual = first.split("\n\n## All frames")
     assert primary.startswith("## Primary endpoints")
+    assert ENDPOINTS in usual
     # The endpoints are those of the whole suite: the other part has no note on them.
-    assert second.strip() == f"## All frames{own}".replace(f"{ENDPOINTS}\n\n", "").strip()
-    assert ENDPOINTS in own
+    assert large.strip() == f"## All frames{usual}".replace(f"{ENDPOINTS}\n\n", "").strip()

@@ -11,6 +11,7 @@ from headbench.reports.view.server import serving
 from headbench.reports.view.settings import ViewSettings
 
 pytest.importorskip("viser", reason="viser is not installed")
+pytestmark = pytest.mark.commands
 CANVAS = {"x": 40, "y": 200, "width": 200, "height": 190}
 """Part of the page beside the panel and below viser's note on software WebGL."""
 ALIKE = 0.5
@@ -32,7 +33,7 @@ def opened(new_tab):
                 else new_tab.faults.append(request.url)
             ),
         )
-        tab.goto(f"http://{address}")
+        tab.goto(server.address)
         tab.get_by_text("Drawn by trained models").wait_for()
         tab.get_by_text(re.compile(r"\d+x\d+: .*sent in")).wait_for()  # a whole frame, not a draft
         return tab
