@@ -202,7 +202,6 @@ REFUSED = {
     "too many coefficients": (lambda: npz(expression=np.zeros((3, 50))), (), "at most 8 coefficients"),
     "half a jaw": (lambda: npz(expression=ONE, jaw=np.zeros((FRAMES, 2))), (), "jaw: expected 3"),
     "a pose of five": (lambda: npz(exp=ONE, pose=np.zeros((FRAMES, 5))), (), "pose: expected 6 numbers"),
-    "far beyond a face": (lambda: npz(expression=ONE + 9e3), (), "coefficients"),
     "pickled objects": (lambda: npz(expression=np.array([{}], object)), (), "expected"),
     "npz of text": (lambda: npz(expression=np.array([["a"]])), (), "numbers"),
     "no expression": (lambda: npz(pose=np.zeros((3, 6))), (), "columns"),
