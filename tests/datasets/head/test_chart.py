@@ -63,7 +63,6 @@ def test_the_file_beside_a_flame_pickle_is_the_chart(tmp_path, name):
         ("vt 0 0\nf 1//1 2//1 3//1\n", "texture coordinates"),
         ("vt nan 0\nf 1/1 2/1 3/1\n", "vt: expected finite numbers"),
         ("vt 1e39 0\nf 1/1 2/1 3/1\n", "vt: expected numbers from -10000 to 10000"),
-        ("\n" * 2**24 + "vt", "at most 16777216 bytes"),
         ("vt 0 0\nf 1/-1 2/1 3/1\n", "texture coordinates"),
         ("vt 0 0\nf 1/1 2/1 3/1\n", "that are not there"),
     ],
