@@ -22,7 +22,6 @@ from ...shared.avatar_files import COMPACT_FILE, read_shared_head
 from ...shared.losses import picture_ssim, psnr, squared_error
 from ..export import neutral_pose
 from .codecs import DRIVING_FILE, ENCODERS, write_coded
-from .file import part_sizes
 from .precision import EXACT, Precision
 from .settings import CompactSettings
 
@@ -55,7 +54,7 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
             form = AdaptedClip(clip) if step is None else apply(step, needs, kept, f"adapting {clip.subject}")
             comparison = Comparison(clip, form, exact, settings.frames, settings.scale)
         own = None if form is None else form.clip
-        content = write_coded(exact, head, out, settings.precision, own, folder / DRIVING_FILE)
+        parts = write_coded(exact, head, out, settings.precision, own, folder / DRIVING_FILE)
         record = stored.record
         source = {"of": avatar_digest(folder), "precision": asdict(settings.precision)}
         shown = record["subject"], record["shape"], record["head_model"]
@@ -64,7 +63,6 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
             "exact_bytes": sum(path.stat().st_size for path in exact.files()),
             "compact_bytes": (out / COMPACT_FILE).stat().st_size,
         }
-        parts = part_sizes(content)
         data: dict[str, Any] = {"file": out / COMPACT_FILE, "precision": settings.precision}
         if isinstance(exact, SplatAvatar):
             data["splats"] = _splats(exact, head)

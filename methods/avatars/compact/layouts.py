@@ -1,0 +1,311 @@
+"""Layouts of the coded files: what the avatars of each method consist of, and the steps of each part.
+
+A layout is called to encode and to decode (`Coder`); it returns the tensors of the method's exact file by name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ....bench.contracts import FloatArray, HeadAsset, IntArray
+from ....bench.errors import InputError
+from ...flashavatar.hyper_gaussians import gaussian_shapes
+from ...gbs.blendshapes import difference_widths
+from ...gbs.storage import GEOMETRY
+from ...gha.gaussian_head import POINTS
+from ...ops.harmonics import C0, sh_basis
+from ...rgbavatar.model import SHAPES
+from ...shared.avatar_files import Subject
+from ...shared.subject_mesh import SubjectMesh
+from ...shared.surface_points import SurfacePoints, full_barycentric
+from .coder import FINER, Coder, from_smallest_three, scale_of, smallest_three
+from .container import read_content
+
+Tensors = dict[str, np.ndarray]
+Layout = Callable[[Coder, HeadAsset, Subject], Tensors]
+
+BARYCENTRIC_STEP = 1 / 64
+COLOURS = "colours"
+"""Name of the coded harmonics."""
+COARSEST_SHAPE = 2
+"""Coarsest class of visibility for the shapes of splats: an error of several steps of size or opacity would put a hidden splat
+before visible ones."""
+LARGEST = 80.0
+"""Logarithms are clamped here, so that sizes cannot overflow."""
+DIFFERENCE_STEP = 0.5
+"""Step of differences relative to that of the attribute: in a pose, several differences add up."""
+
+
+def read_coded(
+    path: Path, head: HeadAsset, layout: Layout
+) -> tuple[Subject, dict[str, Tensor], Mapping[str, str]]:
+    """Subject, tensors of the exact file, and texts of a coded file.
+
+    Raises `InputError` for a damaged file and one of another layout; the values remain to be checked.
+    """
+    content = read_content(path)
+    version = content.text.get("head_model")
+    if version != head.version:
+        raise InputError(path, "head_model", repr(head.version), repr(version)[:80])
+    try:
+        coder = Coder.of(content)
+        subject = code_subject(coder, head)
+        with np.errstate(over="ignore", invalid="ignore"):
+            tensors = layout(coder, head, subject)
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise InputError(path, "", "arrays of a coded avatar that fit each other", repr(error)[:200]) from error
+    if coder.left:
+        raise InputError(path, ", ".join(coder.left)[:80], "no further arrays", "some")
+    return subject, {name: torch.from_numpy(np.array(values)) for name, values in tensors.items()}, content.text
+
+
+def code_subject(coder: Coder, head: HeadAsset, subject: Subject | None = None) -> Subject:
+    """Code the subject of an avatar."""
+    shape = coder.exact("shape", None if subject is None else subject.shape, "subject")
+    offset = coder.rounded(
+        "static_offset",
+        *(coder.precision.subject, "subject"),
+        values=None if subject is None else subject.static_offset,
+    )
+    if shape.shape != (head.shape_basis.shape[2],) or offset.shape != head.template.shape:
+        raise ValueError(f"a subject of another head model, shapes {shape.shape} and {offset.shape}")
+    if not (np.isfinite(shape).all() and np.isfinite(offset).all()):
+        raise ValueError("a subject whose numbers are not finite")
+    return Subject(coder.text["name"], coder.text["head_model"], shape, offset)
+
+
+def code_points(coder: Coder, head: HeadAsset) -> tuple[Tensors, SurfacePoints]:
+    """Surface points of splats, and their tensors."""
+    triangles = coder.whole("triangles", part="triangles")
+    step = BARYCENTRIC_STEP if coder.precision.positions else 0.0
+    inside = coder.rounded("barycentric", step, "triangles")
+    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(head.faces):
+        raise ValueError("triangles that the head model does not have")
+    tensors = {"triangles": triangles.astype(np.int32), "barycentric": inside}
+    return tensors, SurfacePoints(triangles, full_barycentric(inside))
+
+
+def code_splats(
+    coder: Coder,
+    *,
+    floor: float,
+    turned: bool = True,
+    means: str = "means",
+    base: FloatArray | float = 0.0,
+) -> tuple[Tensors, IntArray]:
+    """Means, log-scales, quaternions and opacities of splats, and their classes of visibility.
+
+    Parameters
+    ----------
+    floor : float
+        Splats smaller than this are placed as finely as one of this size.
+    turned : bool
+        Whether an expression adds to the quaternions. Then all four components are kept, of any
+        length; otherwise three are enough, see `smallest_three`.
+    means : str
+        Name of the means; "" if the splats have none.
+    base : FloatArray | float
+        Points to which the means are close.
+    """
+    precision, source = coder.precision, coder.source
+    count = 0 if source is None else len(source.tensors["log_scales"])
+    classes = coder.classes("classes", None if source is None else source.weights, count)
+    scale = scale_of(classes, COARSEST_SHAPE)
+    log_scales = coder.rounded("log_scales", precision.scales, "scales", unit=scale)
+    if not turned and precision.rotations:
+        imaginary = None if source is None else smallest_three(coder.given("quats"))
+        quats = from_smallest_three(
+            coder.rounded("quats", precision.rotations, "rotations", unit=scale, values=imaginary)
+        )
+    else:
+        quats = coder.rounded("quats", precision.rotations, "rotations", unit=scale)
+    opacities = coder.rounded("opacities", precision.opacities, "opacities", unit=scale[:, 0])
+    tensors = {"log_scales": log_scales, "quats": quats, "opacities": opacities}
+    if means:
+        size = splat_size(log_scales, floor)
+        tensors[means] = coder.rounded(means, precision.positions, "positions", unit=scale * size, base=base)
+    return tensors, classes
+
+
+def splat_size(log_scales: FloatArray, floor: float) -> FloatArray:
+    """(N, 1) geometric mean of the standard deviations of (N, 3) log-scales, at least ``floor``."""
+    mean = log_scales.astype(np.float64).mean(1, keepdims=True)
+    return np.maximum(np.exp(np.minimum(mean, LARGEST)), floor)
+
+
+def code_harmonics(coder: Coder, classes: IntArray) -> Tensors:
+    """(N, 3) and (N, 3, K - 1) harmonics, coded by their mean squared colour over directions."""
+    values = metric = None
+    if coder.source is not None:
+        dc, rest = coder.given("sh_dc"), coder.given("sh_rest")
+        values = np.concatenate([dc[:, :, None], rest], axis=2).reshape(len(dc), -1)
+        metric = colour_metric(rest.shape[2] + 1, coder.source.metrics.get("directions"))
+    step, scale = coder.precision.harmonics, scale_of(classes)
+    options = {"scale": scale, "values": values, "metric": metric}
+    joined = coder.vectors(COLOURS, step, "harmonics", **options).reshape(len(classes), 3, -1)
+    return {"sh_dc": joined[:, :, 0], "sh_rest": joined[:, :, 1:]}
+
+
+def colour_metric(count: int, directions: FloatArray | None = None) -> FloatArray:
+    """(3 K, 3 K) metric of harmonics of three channels, K = ``count`` numbers each: mean squared colour over directions.
+
+    Parameters
+    ----------
+    directions : FloatArray | None
+        (M, 3) unit vectors along which training views see the splats, if the harmonics stay in the world: four fifths
+        of the weight are theirs, and one fifth is that of the whole sphere, so that other views are kept, too.
+    """
+    whole = np.eye(count) / (4 * np.pi)
+    if directions is not None:
+        basis = sh_basis(torch.from_numpy(np.asarray(directions, np.float64)), math.isqrt(count) - 1).numpy()
+        whole = 0.2 * whole + 0.8 * basis.T @ basis / len(basis)
+    return np.kron(np.eye(3), whole)
+
+
+def code_others(coder: Coder, exact: Sequence[str] = ()) -> Tensors:
+    """All other tensors: those of two and more axes are weights of networks, except ``exact``; vectors stay as they are."""
+    found = {}
+    for name in coder.left:
+        if "/" in name:
+            continue
+        if coder.source is not None:
+            weights = coder.source.tensors[name].ndim > 1 and name not in exact
+        else:
+            weights = f"{name}/steps" in coder.arrays
+        found[name] = coder.matrix(name, FINER * coder.precision.networks) if weights else coder.exact(name)
+    return found
+
+
+def bound(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
+    """Splats bound to triangles, with harmonics: GaussianAvatars."""
+    triangles = coder.whole("binding", part="triangles")
+    splats, classes = code_splats(coder, floor=0.02, turned=False)
+    return {"binding": triangles, **splats, **code_harmonics(coder, classes)}
+
+
+def blended(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
+    """Neutral splats on a surface with differences for expressions: GaussianBlendshapes."""
+    tensors, points = code_points(coder, head)
+    mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
+    rest = points.positions(mesh.canonical.numpy(), mesh.faces.numpy()).astype(np.float32)
+    splats, classes = code_splats(coder, floor=5e-5, base=rest)
+    splats |= code_harmonics(coder, classes)
+    moved_by = coder.whole("moved_by", part="differences")
+    owners, expressions = np.nonzero(moved_by)
+    coefficients = coder.exact("coefficients", part="differences").astype(np.float64)
+    values = None if coder.source is None else coder.given("differences")
+    columns = None
+    changes = _change_steps(coder, splat_size(splats["log_scales"], 5e-5)[owners], difference_widths(0))
+    if changes is None:
+        differences = coder.exact("differences", values, "differences")
+    else:
+        units = changes / coefficients[expressions][:, None]
+        if values is not None:
+            columns = values.shape[1]
+            units_all = _padded(units, columns)
+            values = values / units_all
+        scale = scale_of(classes[owners], COARSEST_SHAPE)
+        weights = coder.source.weights[owners] if coder.source is not None and coder.source.weights is not None else None
+        differences = coder.vectors("differences", DIFFERENCE_STEP, "differences", scale=scale, values=values, weights=weights, centred=False)
+        differences = differences * _padded(units, differences.shape[1])
+    columns = [splats[name].reshape(len(classes), -1) for name in (*GEOMETRY, "sh_rest")]
+    tensors["splats"] = np.concatenate(columns, axis=1)
+    tensors["moved_by"] = np.packbits(moved_by > 0, axis=1)
+    tensors["differences"] = differences.astype(np.float32)
+    return tensors
+
+
+def _padded(units: FloatArray, columns: int) -> FloatArray:
+    return np.concatenate([units, np.repeat(units[:, -1:], columns - units.shape[1], axis=1)], axis=1)
+
+
+def _change_steps(coder: Coder, size: FloatArray, widths: Mapping[str, int]) -> FloatArray | None:
+    """(M, C) steps of changes of attributes of splats of these (M, 1) sizes; None where one of them is exact."""
+    precision = coder.precision
+    colour = precision.harmonics / C0  # a coefficient changes colours by C0, root mean square over directions
+    steps = {
+        "means": precision.positions * size,
+        "log_scales": precision.scales,
+        "quats": precision.rotations,
+        "opacities": precision.opacities,
+        "sh_dc": colour,
+        "colors": colour,
+    }
+    own = [np.broadcast_to(steps[name], (len(size), width)) for name, width in widths.items() if width]
+    return np.concatenate(own, axis=1) if all(part.all() for part in own) else None
+
+
+def reduced(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
+    """Splats on a surface with learnt blendshapes: RGBAvatar."""
+    tensors, _ = code_points(coder, head)
+    splats, classes = code_splats(coder, floor=5e-5)
+    tensors |= splats
+    scale = scale_of(classes)
+    precision, source = coder.precision, coder.source
+    metric = None if source is None else np.eye(3) * C0**2
+    tensors["colors"] = coder.vectors("colors", precision.harmonics, "harmonics", scale=scale, metric=metric)
+    values = None
+    if source is not None:  # (N, K, 10)
+        values = np.concatenate([coder.given(name) for name in SHAPES.values()], axis=2)
+    units = _change_steps(coder, splat_size(splats["log_scales"], 5e-5), {"means": 3, "quats": 4, "colors": 3})
+    if units is None:
+        table = coder.exact("shapes", values, "differences")
+    else:
+        values = None if values is None else (values / units[:, None]).reshape(len(values), -1)
+        found = coder.vectors("shapes", 1.0, "differences", scale=scale_of(classes, COARSEST_SHAPE), values=values, centred=False)
+        table = found.reshape(len(units), -1, units.shape[1]) * units[:, None]
+    parts = np.split(table.swapaxes(0, 1), (3, 7), axis=2)
+    tensors |= {name: part.astype(np.float32) for name, part in zip(SHAPES.values(), parts)}
+    return tensors | code_others(coder)
+
+
+def offsets(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
+    """Splats that a network translates, rotates and scales: FlashAvatar."""
+    tensors, _ = code_points(coder, head)
+    splats, classes = code_splats(coder, floor=5e-5, means="")
+    tensors |= splats | code_harmonics(coder, classes)
+    for name in (*gaussian_shapes(1),):  # HyperGaussians
+        if coder.has(name):
+            metric = None
+            if coder.source is not None:
+                metric = np.diag(np.maximum(np.abs(coder.source.tensors[name]).max(0), 1e-6) ** -2.0)
+            step = FINER * coder.precision.networks
+            tensors[name] = coder.vectors(name, step, "networks", metric=metric, centred=False)
+    return tensors | code_others(coder)
+
+
+def networks(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
+    """Points with features, and networks: Gaussian Head Avatar."""
+    splats, classes = code_splats(coder, floor=1e-4, means="points")
+    metric = None
+    if coder.source is not None:
+        spread = np.maximum(coder.source.tensors["features"].std(0, dtype=np.float64), 1e-6)
+        metric = np.diag(spread**-2)
+    splats["features"] = coder.vectors("features", coder.precision.tables, "tables", scale=scale_of(classes), metric=metric)
+    columns = [splats[name].reshape(len(classes), -1) for name in (*POINTS, "features")]
+    return {"table": np.concatenate(columns, axis=1), **code_others(coder, ("landmarks",))}
+
+
+def grid(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
+    """A hash grid with networks, and occupied cells: INSTA."""
+    occupied = coder.whole("occupied").astype(np.uint8)
+    spread = None
+    if coder.source is not None:
+        spread = np.array([coder.source.tensors["table"].std(dtype=np.float64)])
+    spread = coder.exact("spread", spread, "tables")
+    step = coder.precision.tables
+    values = None
+    if coder.source is not None:
+        values = coder.given("table")
+        if step:
+            from .coder import levels
+            u = step * float(spread[0])
+            values = np.stack([levels(c / u) for c in values.T.astype(np.float64)], 1) * u
+    table = coder.rounded("table", step, "tables", unit=spread.astype(np.float64), values=values)
+    return {"occupied": occupied, "table": table, **code_others(coder)}
