@@ -158,7 +158,11 @@ def write_field(path: Path, parameters: Mapping[str, Tensor], occupied: np.ndarr
 
 
 def field_of(
-    path: Path, arrays: Mapping[str, np.ndarray], architecture: Architecture, size: tuple[int, ...], device: str
+    path: Path,
+    arrays: Mapping[str, np.ndarray],
+    architecture: Architecture,
+    size: tuple[int, ...],
+    device: str,
 ) -> tuple[dict[str, Tensor], np.ndarray]:
     """Float32 parameters, and flat indices of occupied cells, of the arrays of a file.
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from ....bench.contracts import Avatar, Clip, FloatArray, HeadAsset, IntArray
+from ....bench.contracts import Avatar, Clip, FloatArray, HeadAsset, IntArray, SplatAvatar
 from ....bench.errors import InputError
 from ....bench.io.arrays import Member, read_arrays
 from ....bench.io.files import digest, read_bytes
@@ -44,7 +44,7 @@ from ...shared.surface_points import point_tensors
 from ...shared.surface_splats import SurfaceAvatar
 from ...shared.tensor_files import read_safetensors
 from ..views import importance, training_views
-from .coder import Coder, Source
+from .coder import Coder, Source, visibility_classes
 from .container import CODEC, Content, write_content
 from .field import field
 from .layouts import Layout, blended, bound, code_subject, grid, networks, offsets, reduced
@@ -111,35 +111,42 @@ def codec_name(precision: Precision) -> str:
     return name if own == Precision() else f"{name} ({digest(asdict(own))[:8]})"
 
 
-def _source(
-    avatar: Avatar,
-    clip: Clip | None,
-    rows: Mapping[str, Tensor | np.ndarray],
-    order: IntArray,
-    others: Mapping[str, Tensor | np.ndarray],
-    metrics: Mapping[str, FloatArray] | None = None,
-) -> Source:
-    """Source of arrays with a row for each splat, which are sorted, and of others."""
-    weights = None if clip is None else importance(avatar, training_views(clip))[order]
-    arrays = {name: _numpy(value)[order] for name, value in rows.items()}
-    return Source(arrays | {name: _numpy(value) for name, value in others.items()}, weights, metrics or {})
+class _Order:
+    """Order of splats in the file: by visibility, whose classes have values of similar range, then by place.
+
+    Parameters
+    ----------
+    places : Tensor | np.ndarray
+        (N,) triangles of the splats, or numbers along a curve through space.
+    """
+
+    def __init__(self, avatar: SplatAvatar, clip: Clip | None, places: Tensor | np.ndarray):
+        weights = None if clip is None else importance(avatar, training_views(clip))
+        self.rows = np.lexsort((_numpy(places), visibility_classes(weights, len(places))))
+        self._weights = None if weights is None else weights[self.rows]
+
+    def source(
+        self,
+        splats: Mapping[str, Tensor | np.ndarray],
+        others: Mapping[str, Tensor | np.ndarray],
+        metrics: Mapping[str, FloatArray] | None = None,
+    ) -> Source:
+        """Source of arrays with a row for each splat, and of others."""
+        arrays = {name: _numpy(value)[self.rows] for name, value in splats.items()}
+        return Source(
+            arrays | {n: _numpy(value) for n, value in others.items()}, self._weights, metrics or {}
+        )
 
 
 def _numpy(values: Tensor | np.ndarray) -> np.ndarray:
     return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
 
 
-def _by_triangle(triangles: Tensor | np.ndarray) -> IntArray:
-    """Order by triangle, stable, since equal depths are drawn in their order."""
-    return np.argsort(_numpy(triangles), kind="stable")
-
-
 def _morton(points: FloatArray, bits: int = 10) -> IntArray:
-    """Order of (N, 3) points along a Morton curve."""
-    low, high = points.min(0, initial=0), points.max(0, initial=0)
+    """Numbers of (N, 3) points along a Morton curve."""
+    low, high = points.min(0, initial=np.inf), points.max(0, initial=-np.inf)
     cells = ((points - low) / np.maximum(high - low, 1e-12) * (2**bits - 1)).astype(np.int64)
-    code = sum(((cells >> bit & 1) << np.arange(3)).sum(1) << 3 * bit for bit in range(bits))
-    return np.argsort(code, kind="stable")
+    return np.asarray(sum(((cells >> bit & 1) << np.arange(3)).sum(1) << 3 * bit for bit in range(bits)))
 
 
 def _ours(avatar: OursAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
@@ -147,7 +154,7 @@ def _ours(avatar: OursAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
     rows = splat_columns(others.pop("splats"))
     rows |= {name: rows[name][:, 0] for name in ("opacities", "binding")}
     rows |= {name: others.pop(name) for name in PER_SPLAT if name in others}
-    source = _source(avatar, clip, rows, _by_triangle(rows["binding"]), others)
+    source = _Order(avatar, clip, rows["binding"]).source(rows, others)
     return Parts(field, source, avatar.subject, {DYNAMIC: ",".join(avatar.field.dynamic)})
 
 
@@ -161,7 +168,7 @@ def _ga(avatar: GAAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
         directions = np.stack([middle - place for place in places.values()])
         metrics["directions"] = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     rows = {**avatar.splat_tensors, "binding": avatar.binding}
-    source = _source(avatar, clip, rows, _by_triangle(avatar.binding), {}, metrics)
+    source = _Order(avatar, clip, avatar.binding).source(rows, {}, metrics)
     return Parts(bound, source, avatar.subject)
 
 
@@ -174,14 +181,14 @@ def _gbs(avatar: GBSAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
     owners, moving = _numpy(stored.entries.owners), _numpy(stored.entries.expressions)
     moved_by = np.zeros((len(stored.points.triangles), stored.expressions), np.int64)
     moved_by[owners, moving] = 1
-    order = _by_triangle(stored.points.triangles)
+    order = _Order(avatar, clip, stored.points.triangles)
     # Rows of the differences follow the order of the splats.
-    place = np.argsort(order)
+    place = np.argsort(order.rows)
     differences = _numpy(stored.differences)[np.lexsort((moving, place[owners]))]
     rows = {**stored.neutral, **point_tensors(stored.points), "moved_by": moved_by}
     others = {"differences": differences, "coefficients": coefficients}
     text = {EXPRESSIONS: str(stored.expressions)}
-    return Parts(blended, _source(avatar, clip, rows, order, others), avatar.subject, text)
+    return Parts(blended, order.source(rows, others), avatar.subject, text)
 
 
 def _gha(avatar: GHAAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
@@ -191,7 +198,7 @@ def _gha(avatar: GHAAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
     columns = np.split(table, np.cumsum([*POINTS.values()]), axis=1)
     rows = dict(zip((*POINTS, "features"), columns))
     rows["opacities"] = rows["opacities"][:, 0]
-    source = _source(avatar, clip, rows, _morton(rows["points"]), others)
+    source = _Order(avatar, clip, _morton(rows["points"])).source(rows, others)
     return Parts(networks, source, avatar.subject, {CONFIG: metadata[CONFIG]})
 
 
@@ -232,7 +239,7 @@ def _surface(
     rows = {name: value for name, value in stored.tensors.items() if widths[name][0] == "N"}
     others = {name: value for name, value in stored.tensors.items() if name not in {*rows, *shapes}}
     rows |= {**shapes, **point_tensors(stored.points)}
-    source = _source(avatar, clip, rows, _by_triangle(stored.points.triangles), others, metrics)
+    source = _Order(avatar, clip, stored.points.triangles).source(rows, others, metrics)
     return Parts(layout, source, avatar.subject, {stored.KEY: stored.text()})
 
 

@@ -21,8 +21,6 @@ RATE_WEIGHT = 2 * np.log(2) / 12
 """Lagrangian weight of a bit, in squared steps: the slope of a fine uniform quantiser, 2 ln 2 / 12."""
 BASIS_STEP, BASIS_BITS = 1 / 1024, 10
 """Step of a transform's basis relative to the largest number of a row, and bits of a number."""
-FINER = 0.5
-"""Factor of the steps of a network's weights: the whole appearance depends on them, and they are a small part of the file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +53,9 @@ class Coder:
         Part of the file of each array that was encoded: a name of a step of `Precision`, or "other".
     """
 
-    def __init__(self, precision: Precision, text: Mapping[str, str], given: Source | Mapping[str, np.ndarray]):
+    def __init__(
+        self, precision: Precision, text: Mapping[str, str], given: Source | Mapping[str, np.ndarray]
+    ):
         self.precision, self.text = precision, text
         self.source = given if isinstance(given, Source) else None
         self.arrays: dict[str, np.ndarray] = {} if isinstance(given, Source) else dict(given)
@@ -122,7 +122,7 @@ class Coder:
         levels = None
         if self.source is not None:
             away = (self.given(name) if values is None else np.asarray(values)) - np.asarray(base, np.float64)
-            levels = np.rint(away / steps).clip(-(2**30), 2**30 - 1)
+            levels = _nearest(away / steps)
         return (self.whole(name, levels, part) * steps + base).astype(np.float32)
 
     def matrix(
@@ -137,7 +137,7 @@ class Coder:
             rows = values.reshape(len(values), -1).astype(np.float64)
             largest = np.abs(rows).max(1, initial=0)
             steps = np.where(largest > 0, step * largest, 1.0).astype(np.float32)
-            chosen = levels((rows / steps[:, None]).ravel()).reshape(values.shape)
+            chosen = _nearest(rows / steps[:, None]).reshape(values.shape)
         steps = self.exact(f"{name}/steps", steps, part)
         found = self.whole(name, chosen, part)
         return (found * steps.reshape(-1, *[1] * (found.ndim - 1)).astype(np.float64)).astype(np.float32)
@@ -149,6 +149,7 @@ class Coder:
         part: str,
         *,
         scale: FloatArray | float = 1.0,
+        units: FloatArray | None = None,
         values: FloatArray | None = None,
         metric: FloatArray | None = None,
         weights: FloatArray | None = None,
@@ -162,6 +163,8 @@ class Coder:
         ----------
         scale : FloatArray | float
             (N, 1) factors of the step.
+        units : FloatArray | None
+            (N, W) units of the numbers, repeated along the columns; where one is 0, the vectors are exact.
         values, weights : FloatArray | None
             To encode: the vectors, and their (N,) weights in the statistics; by default, those of the splats.
         metric : FloatArray | None
@@ -170,33 +173,26 @@ class Coder:
         centred : bool
             Whether the mean is subtracted; without, vectors that round to 0 are decoded as 0.
         """
-        if not step:
+        if not step or (units is not None and not units.all()):
             return self.exact(name, values, part)
         basis = mean = chosen = None
         if self.source is not None:
             values = np.asarray(self.given(name) if values is None else values, np.float64)
+            values = values / _columns(units, values.shape[1])
             metric = self.source.metrics.get(name, np.eye(values.shape[1])) if metric is None else metric
             shares = self.source.weights if weights is None else weights
             if shares is None or not shares.sum() > 0:
                 shares = np.ones(len(values))
             shares = shares[:, None] / max(shares.sum(), 1e-30)
             mean = ((shares * values).sum(0) * centred).astype(np.float32)
-            if KLT:
-                basis, chosen = _transformed(values - mean, metric, shares, step * scale)
-            else:
-                unit = step / np.sqrt(np.maximum(np.diag(metric), 1e-12))
-                chosen = np.stack([levels(c) for c in ((values - mean) / (unit * scale)).T]).T
-                self.exact(f"{name}/unit", unit, part)
-                self._pass(name, chosen, part); self._pass(f"{name}/mean", mean, part)
-                return (chosen * (unit * scale) + mean).astype(np.float32)
-        if not KLT:
-            return ((self.whole(name) * scale) * self.exact(f"{name}/unit").astype(float) + self.exact(f"{name}/mean")).astype(np.float32)
+            basis, chosen = _transformed(values - mean, metric, shares, step * scale)
         basis = self.matrix(f"{name}/basis", BASIS_STEP, part, basis)
         mean = self.exact(f"{name}/mean", mean, part)
         coordinates = self.whole(name, chosen, part) * (step * scale)
         if len(coordinates) * len(mean) > MOST_NUMBERS:
             raise ValueError(f"{name} has {len(coordinates)} vectors of {len(mean)} numbers")
-        return (coordinates @ basis.astype(np.float64) + mean).astype(np.float32)
+        found = coordinates @ basis.astype(np.float64) + mean
+        return (found * _columns(units, len(mean))).astype(np.float32)
 
     def classes(self, name: str = "classes", weights: FloatArray | None = None, count: int = 0) -> IntArray:
         """Classes of visibility, see `visibility_classes`."""
@@ -204,10 +200,8 @@ class Coder:
         return self.whole(name, values, "classes").clip(FINEST, COARSEST)
 
 
-import os
-
-KLT = not os.environ.get("NOKLT")
-NORDO = bool(os.environ.get("NORDO"))
+def _columns(units: FloatArray | None, count: int) -> FloatArray | float:
+    return 1.0 if units is None else units[:, np.arange(count) % units.shape[1]]
 
 
 def _transformed(
@@ -220,29 +214,15 @@ def _transformed(
     seen = values @ visible
     directions = np.linalg.eigh((seen * shares).T @ seen)[1][:, ::-1]
     coordinates = seen @ directions / steps
-    chosen = np.stack([levels(column) for column in coordinates.T], axis=1)
+    chosen = _nearest(coordinates)
     gain = (coordinates**2 - (coordinates - chosen) ** 2).sum(0)
     kept = gain > RATE_WEIGHT * BASIS_BITS * values.shape[1]
     return (directions.T @ back)[kept], chosen[:, kept]
 
 
-def levels(values: FloatArray, rounds: int = 3) -> IntArray:
-    """Rate-distortion optimised quantisation of values in units of steps (`RATE_WEIGHT`).
-
-    For each value the nearest level, the next one towards 0, and 0 are compared, with the bits that the levels of all values
-    take; these are estimated from the choice before, ``rounds`` times.
-    """
-    nearest = np.rint(values).clip(-(2**30), 2**30 - 1).astype(np.int64)
-    if NORDO: return nearest
-    options = np.stack([nearest, nearest - np.sign(nearest), np.zeros_like(nearest)])
-    error, chosen = (options - values) ** 2, nearest
-    for _ in range(rounds if len(values) else 0):
-        present, counts = np.unique(chosen, return_counts=True)
-        bits = np.log2(len(chosen) + 1) - np.log2(counts)
-        where = np.searchsorted(present, options).clip(0, len(present) - 1)
-        rate = np.where(present[where] == options, bits[where], np.log2(len(chosen) + 1) + 8.0)
-        chosen = np.take_along_axis(options, (error + RATE_WEIGHT * rate).argmin(0)[None], 0)[0]
-    return chosen
+def _nearest(values: FloatArray) -> FloatArray:
+    """The nearest whole numbers, at most 2^30."""
+    return np.rint(values).clip(-(2**30), 2**30 - 1)
 
 
 def visibility_classes(weights: FloatArray | None, count: int) -> IntArray:

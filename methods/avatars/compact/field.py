@@ -41,9 +41,7 @@ def field(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     return tensors | code_others(coder, exact)
 
 
-def _plane(
-    coder: Coder, name: str, shares: FloatArray | None, metric: FloatArray | None
-) -> FloatArray:
+def _plane(coder: Coder, name: str, shares: FloatArray | None, metric: FloatArray | None) -> FloatArray:
     """An (S, C) plane. Samples that no splat reads are left out and become 0."""
     used = coder.whole(f"{name}/used", None if shares is None else shares > 0, "planes") > 0
     own = None if shares is None else shares[used]
@@ -68,14 +66,18 @@ def _lines(coder: Coder) -> FloatArray:
         values = lines.reshape(-1, lines.shape[3])
     shape = coder.whole("lines/shape", shape, "lines")
     found = coder.vectors(
-        "lines", coder.precision.lines, "lines", values=values, metric=metric, weights=None if values is None else np.ones(len(values)), centred=False
+        "lines",
+        coder.precision.lines,
+        "lines",
+        values=values,
+        metric=metric,
+        weights=None if values is None else np.ones(len(values)),
+        centred=False,
     )
     return found.reshape(*shape, found.shape[1])
 
 
-def _plane_shares(
-    coder: Coder, head: HeadAsset, subject: Subject, splats: FloatArray
-) -> list[FloatArray]:
+def _plane_shares(coder: Coder, head: HeadAsset, subject: Subject, splats: FloatArray) -> list[FloatArray]:
     """(S,) for each plane: sum over splats of weight times interpolation weight of the sample; 0 if no splat reads it."""
     mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
     frames = CanonicalFrames.of(mesh.frames(mesh.canonical))

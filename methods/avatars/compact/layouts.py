@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,23 +20,24 @@ from ...flashavatar.hyper_gaussians import gaussian_shapes
 from ...gbs.blendshapes import difference_widths
 from ...gbs.storage import GEOMETRY
 from ...gha.gaussian_head import POINTS
-from ...ops.harmonics import C0, sh_basis
+from ...ops.harmonics import C0, sh_basis, sh_degree
 from ...rgbavatar.model import SHAPES
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
 from ...shared.surface_points import SurfacePoints, full_barycentric
-from .coder import FINER, Coder, from_smallest_three, scale_of, smallest_three
+from .coder import Coder, from_smallest_three, scale_of, smallest_three
 from .container import read_content
 
 Tensors = dict[str, np.ndarray]
 Layout = Callable[[Coder, HeadAsset, Subject], Tensors]
 
-BARYCENTRIC_STEP = 1 / 64
 COLOURS = "colours"
 """Name of the coded harmonics."""
 COARSEST_SHAPE = 2
 """Coarsest class of visibility for the shapes of splats: an error of several steps of size or opacity would put a hidden splat
 before visible ones."""
+FLOOR = 5e-5
+"""Splats on a surface smaller than this, metres, are placed as finely as one of this size."""
 LARGEST = 80.0
 """Logarithms are clamped here, so that sizes cannot overflow."""
 DIFFERENCE_STEP = 0.5
@@ -59,10 +61,16 @@ def read_coded(
         with np.errstate(over="ignore", invalid="ignore"):
             tensors = layout(coder, head, subject)
     except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise InputError(path, "", "arrays of a coded avatar that fit each other", repr(error)[:200]) from error
+        raise InputError(
+            path, "", "arrays of a coded avatar that fit each other", repr(error)[:200]
+        ) from error
     if coder.left:
         raise InputError(path, ", ".join(coder.left)[:80], "no further arrays", "some")
-    return subject, {name: torch.from_numpy(np.array(values)) for name, values in tensors.items()}, content.text
+    return (
+        subject,
+        {name: torch.from_numpy(np.array(values)) for name, values in tensors.items()},
+        content.text,
+    )
 
 
 def code_subject(coder: Coder, head: HeadAsset, subject: Subject | None = None) -> Subject:
@@ -80,10 +88,10 @@ def code_subject(coder: Coder, head: HeadAsset, subject: Subject | None = None) 
     return Subject(coder.text["name"], coder.text["head_model"], shape, offset)
 
 
-def code_points(coder: Coder, head: HeadAsset) -> tuple[Tensors, SurfacePoints]:
+def code_points(coder: Coder, head: HeadAsset, finest: float = 1 / 64) -> tuple[Tensors, SurfacePoints]:
     """Surface points of splats, and their tensors."""
     triangles = coder.whole("triangles", part="triangles")
-    step = BARYCENTRIC_STEP if coder.precision.positions else 0.0
+    step = finest if coder.precision.positions else 0.0
     inside = coder.rounded("barycentric", step, "triangles")
     if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(head.faces):
         raise ValueError("triangles that the head model does not have")
@@ -178,7 +186,7 @@ def code_others(coder: Coder, exact: Sequence[str] = ()) -> Tensors:
             weights = coder.source.tensors[name].ndim > 1 and name not in exact
         else:
             weights = f"{name}/steps" in coder.arrays
-        found[name] = coder.matrix(name, FINER * coder.precision.networks) if weights else coder.exact(name)
+        found[name] = coder.matrix(name, coder.precision.networks) if weights else coder.exact(name)
     return found
 
 
@@ -191,92 +199,73 @@ def bound(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
 
 def blended(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     """Neutral splats on a surface with differences for expressions: GaussianBlendshapes."""
-    tensors, points = code_points(coder, head)
+    tensors, points = code_points(coder, head, 1 / 16)  # positions are relative to the rounded points
     mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
     rest = points.positions(mesh.canonical.numpy(), mesh.faces.numpy()).astype(np.float32)
-    splats, classes = code_splats(coder, floor=5e-5, base=rest)
+    splats, classes = code_splats(coder, floor=FLOOR, base=rest)
     splats |= code_harmonics(coder, classes)
     moved_by = coder.whole("moved_by", part="differences")
     owners, expressions = np.nonzero(moved_by)
+    # The root mean squares of the expression coefficients in training.
     coefficients = coder.exact("coefficients", part="differences").astype(np.float64)
-    values = None if coder.source is None else coder.given("differences")
-    columns = None
-    changes = _change_steps(coder, splat_size(splats["log_scales"], 5e-5)[owners], difference_widths(0))
-    if changes is None:
-        differences = coder.exact("differences", values, "differences")
-    else:
-        units = changes / coefficients[expressions][:, None]
-        if values is not None:
-            columns = values.shape[1]
-            units_all = _padded(units, columns)
-            values = values / units_all
-        scale = scale_of(classes[owners], COARSEST_SHAPE)
-        weights = coder.source.weights[owners] if coder.source is not None and coder.source.weights is not None else None
-        differences = coder.vectors("differences", DIFFERENCE_STEP, "differences", scale=scale, values=values, weights=weights, centred=False)
-        differences = differences * _padded(units, differences.shape[1])
+    widths = difference_widths(sh_degree(torch.from_numpy(splats["sh_rest"])))
+    units = _units(coder, splats["log_scales"], widths)[owners] / coefficients[expressions][:, None]
+    weights = None if coder.source is None or coder.source.weights is None else coder.source.weights[owners]
+    scale = scale_of(classes[owners], COARSEST_SHAPE)
+    options = {"scale": scale, "units": units, "weights": weights, "centred": False}
+    tensors["differences"] = coder.vectors("differences", DIFFERENCE_STEP, "differences", **options)
     columns = [splats[name].reshape(len(classes), -1) for name in (*GEOMETRY, "sh_rest")]
     tensors["splats"] = np.concatenate(columns, axis=1)
     tensors["moved_by"] = np.packbits(moved_by > 0, axis=1)
-    tensors["differences"] = differences.astype(np.float32)
     return tensors
 
 
-def _padded(units: FloatArray, columns: int) -> FloatArray:
-    return np.concatenate([units, np.repeat(units[:, -1:], columns - units.shape[1], axis=1)], axis=1)
-
-
-def _change_steps(coder: Coder, size: FloatArray, widths: Mapping[str, int]) -> FloatArray | None:
-    """(M, C) steps of changes of attributes of splats of these (M, 1) sizes; None where one of them is exact."""
+def _units(coder: Coder, log_scales: FloatArray, widths: Mapping[str, int]) -> FloatArray:
+    """(N, C) steps of changes of attributes of splats; 0 where an attribute is exact."""
     precision = coder.precision
-    colour = precision.harmonics / C0  # a coefficient changes colours by C0, root mean square over directions
-    steps = {
-        "means": precision.positions * size,
-        "log_scales": precision.scales,
-        "quats": precision.rotations,
-        "opacities": precision.opacities,
-        "sh_dc": colour,
-        "colors": colour,
-    }
-    own = [np.broadcast_to(steps[name], (len(size), width)) for name, width in widths.items() if width]
-    return np.concatenate(own, axis=1) if all(part.all() for part in own) else None
+    # A coefficient of harmonics changes colours by C0, root mean square over directions.
+    steps: dict[str, FloatArray | float] = dict.fromkeys(
+        ("sh_dc", "sh_rest", "colors"), precision.harmonics / C0
+    )
+    steps["means"] = precision.positions * splat_size(log_scales, FLOOR)
+    steps |= {"log_scales": precision.scales, "quats": precision.rotations, "opacities": precision.opacities}
+    parts = [np.broadcast_to(steps[name], (len(log_scales), width)) for name, width in widths.items()]
+    return np.concatenate(parts, axis=1)
 
 
 def reduced(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     """Splats on a surface with learnt blendshapes: RGBAvatar."""
     tensors, _ = code_points(coder, head)
-    splats, classes = code_splats(coder, floor=5e-5)
-    tensors |= splats
-    scale = scale_of(classes)
-    precision, source = coder.precision, coder.source
-    metric = None if source is None else np.eye(3) * C0**2
-    tensors["colors"] = coder.vectors("colors", precision.harmonics, "harmonics", scale=scale, metric=metric)
+    splats, classes = code_splats(coder, floor=FLOOR)
+    colour = None if coder.source is None else C0**2 * np.eye(3)
+    options: dict[str, Any] = {"scale": scale_of(classes), "metric": colour}
+    splats["colors"] = coder.vectors("colors", coder.precision.harmonics, "harmonics", **options)
     values = None
-    if source is not None:  # (N, K, 10)
+    if coder.source is not None:  # (N, K, 10) as (N, 10 K)
         values = np.concatenate([coder.given(name) for name in SHAPES.values()], axis=2)
-    units = _change_steps(coder, splat_size(splats["log_scales"], 5e-5), {"means": 3, "quats": 4, "colors": 3})
-    if units is None:
-        table = coder.exact("shapes", values, "differences")
-    else:
-        values = None if values is None else (values / units[:, None]).reshape(len(values), -1)
-        found = coder.vectors("shapes", 1.0, "differences", scale=scale_of(classes, COARSEST_SHAPE), values=values, centred=False)
-        table = found.reshape(len(units), -1, units.shape[1]) * units[:, None]
-    parts = np.split(table.swapaxes(0, 1), (3, 7), axis=2)
-    tensors |= {name: part.astype(np.float32) for name, part in zip(SHAPES.values(), parts)}
-    return tensors | code_others(coder)
+        values = values.reshape(len(values), -1)
+    widths = {name: splats[name].shape[1] for name in SHAPES}
+    units = _units(coder, splats["log_scales"], widths)
+    options = {"scale": scale_of(classes, COARSEST_SHAPE), "units": units, "values": values, "centred": False}
+    found = coder.vectors("shapes", 1.0, "differences", **options)
+    table = found.reshape(len(found), -1, units.shape[1]).swapaxes(0, 1)
+    parts = np.split(table, np.cumsum([*widths.values()])[:-1], axis=2)
+    return {**tensors, **splats, **dict(zip(SHAPES.values(), parts)), **code_others(coder)}
 
 
 def offsets(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     """Splats that a network translates, rotates and scales: FlashAvatar."""
     tensors, _ = code_points(coder, head)
-    splats, classes = code_splats(coder, floor=5e-5, means="")
+    splats, classes = code_splats(coder, floor=FLOOR, means="")
     tensors |= splats | code_harmonics(coder, classes)
-    for name in (*gaussian_shapes(1),):  # HyperGaussians
+    for name in gaussian_shapes(1):  # those of HyperGaussians
         if coder.has(name):
-            metric = None
-            if coder.source is not None:
-                metric = np.diag(np.maximum(np.abs(coder.source.tensors[name]).max(0), 1e-6) ** -2.0)
-            step = FINER * coder.precision.networks
-            tensors[name] = coder.vectors(name, step, "networks", metric=metric, centred=False)
+            largest = (
+                None if coder.source is None else np.abs(coder.source.tensors[name]).max(0, initial=1e-6)
+            )
+            metric = None if largest is None else np.diag(largest**-2.0)
+            options: dict[str, Any] = {"metric": metric, "centred": False}
+            tensors[name] = coder.vectors(name, coder.precision.networks, "networks", **options)
     return tensors | code_others(coder)
 
 
@@ -285,9 +274,9 @@ def networks(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     splats, classes = code_splats(coder, floor=1e-4, means="points")
     metric = None
     if coder.source is not None:
-        spread = np.maximum(coder.source.tensors["features"].std(0, dtype=np.float64), 1e-6)
-        metric = np.diag(spread**-2)
-    splats["features"] = coder.vectors("features", coder.precision.tables, "tables", scale=scale_of(classes), metric=metric)
+        metric = np.diag(np.maximum(coder.source.tensors["features"].std(0, dtype=np.float64), 1e-6) ** -2)
+    options: dict[str, Any] = {"scale": scale_of(classes), "metric": metric}
+    splats["features"] = coder.vectors("features", coder.precision.tables, "tables", **options)
     columns = [splats[name].reshape(len(classes), -1) for name in (*POINTS, "features")]
     return {"table": np.concatenate(columns, axis=1), **code_others(coder, ("landmarks",))}
 
@@ -295,17 +284,7 @@ def networks(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
 def grid(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     """A hash grid with networks, and occupied cells: INSTA."""
     occupied = coder.whole("occupied").astype(np.uint8)
-    spread = None
-    if coder.source is not None:
-        spread = np.array([coder.source.tensors["table"].std(dtype=np.float64)])
-    spread = coder.exact("spread", spread, "tables")
-    step = coder.precision.tables
-    values = None
-    if coder.source is not None:
-        values = coder.given("table")
-        if step:
-            from .coder import levels
-            u = step * float(spread[0])
-            values = np.stack([levels(c / u) for c in values.T.astype(np.float64)], 1) * u
-    table = coder.rounded("table", step, "tables", unit=spread.astype(np.float64), values=values)
+    spread = None if coder.source is None else coder.source.tensors["table"].std(dtype=np.float64).reshape(1)
+    unit = coder.exact("spread", spread, "tables").astype(np.float64)
+    table = coder.rounded("table", coder.precision.tables, "tables", unit=unit)
     return {"occupied": occupied, "table": table, **code_others(coder)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ....bench.contracts import Avatar, ByteArray, Clip, HeadAsset, Progress, SplatAvatar, no_progress
+from ....bench.contracts import Avatar, ByteArray, Clip, Progress, SplatAvatar, no_progress
 from ....bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
-from ....bench.engine.stored import StoredAvatar, avatar_digest, open_avatar, write_avatar_record
+from ....bench.engine.stored import avatar_digest, open_avatar, write_avatar_record
 from ....bench.errors import InputError
 from ....bench.io.images import quantise
 from ....bench.protocol import evenly_with_ends
@@ -22,10 +22,10 @@ from ...shared.avatar_files import COMPACT_FILE, read_shared_head
 from ...shared.losses import picture_ssim, psnr, squared_error
 from ..export import neutral_pose
 from .codecs import DRIVING_FILE, ENCODERS, write_coded
-from .precision import EXACT, Precision
+from .precision import EXACT
 from .settings import CompactSettings
 
-SIMPLIFIED, WHOLE = "left out", "all"
+WHOLE = "all"
 
 
 def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) -> CommandResult:
@@ -65,48 +65,20 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
         }
         data: dict[str, Any] = {"file": out / COMPACT_FILE, "precision": settings.precision}
         if isinstance(exact, SplatAvatar):
-            data["splats"] = _splats(exact, head)
-            data["splats_kept"] = _splats(_read(stored, out), head)
+            data["splats"] = len(exact.splats(neutral_pose(head)).means)
         data |= {"whole": whole, "parts": {part: {"compact_bytes": size} for part, size in parts.items()}}
         if own is not None:
-            precision = settings.precision.scaled
-
-            def read_as(variant: Precision) -> Avatar:
-                """The avatar read back from a file of these steps."""
-                write_coded(exact, head, Path(scratch) / "coded", variant, own, folder / DRIVING_FILE)
-                return _read(stored, Path(scratch) / "coded")
-
-            names = [part for part in precision.parts if part in parts]
-            costs = _costs(names, precision, read_as, comparison, progress)
-            data |= {"frames": len(comparison.keys), "exact": _plain(comparison.exact), "quality": costs}
+            precision, quality = settings.precision.scaled, {}
+            variants = {
+                n: replace(EXACT, **{n: getattr(precision, n)}) for n in precision.parts if n in parts
+            }
+            for done, (name, variant) in enumerate([*variants.items(), (WHOLE, precision)]):
+                progress(done, len(variants) + 1, name)
+                coded = Path(scratch) / "coded"
+                write_coded(exact, head, coded, variant, own, folder / DRIVING_FILE)
+                quality[name] = _plain(comparison(stored.method.create().load(coded, device="cpu")))
+            data |= {"frames": len(comparison.keys), "exact": _plain(comparison.exact), "quality": quality}
     return CommandResult(_text(data), data)
-
-
-def _read(stored: StoredAvatar, folder: Path) -> Avatar:
-    avatar: Avatar = stored.method.create().load(folder, device="cpu")
-    return avatar
-
-
-def _splats(avatar: Avatar, head: HeadAsset) -> int:
-    assert isinstance(avatar, SplatAvatar)
-    return len(avatar.splats(neutral_pose(head)).means)
-
-
-def _costs(
-    names: Sequence[str],
-    precision: Precision,
-    read_as: Callable[[Precision], Avatar],
-    comparison: Comparison,
-    progress: Progress,
-) -> dict[str, dict[str, float | None]]:
-    """Quality with each part rounded alone, with all parts rounded, and with invisible splats removed only."""
-    variants = {name: replace(EXACT, **{name: getattr(precision, name)}) for name in names}
-    variants |= {SIMPLIFIED: EXACT, WHOLE: precision}
-    result = {}
-    for done, (name, variant) in enumerate(variants.items()):
-        progress(done, len(variants), name)
-        result[name] = _plain(comparison(read_as(variant)))
-    return result
 
 
 def _plain(quality: Quality) -> dict[str, float | None]:
@@ -115,29 +87,20 @@ def _plain(quality: Quality) -> dict[str, float | None]:
 
 
 def _text(data: Mapping[str, Any]) -> str:
-    qualities, exact = data.get("quality", {}), data.get("exact")
+    qualities, exact, whole = data.get("quality", {}), data.get("exact"), data["whole"]
     head = f"{'part':<12}{'exact':>12}{'coded':>12}"
     if exact:
         head += f"{'dB to truth':>14}{'SSIM to truth':>15}{'dB to exact':>13}"
     rows = [head]
-    for part, sizes in data["parts"].items():
-        rows.append(_row(part, sizes, qualities.get(part), exact))
-    if exact:
-        rows.append(_row(SIMPLIFIED, {}, qualities[SIMPLIFIED], exact))
-    rows.append(_row(WHOLE, data["whole"], qualities.get(WHOLE), exact))
-    whole = data["whole"]
+    rows += [_row(part, sizes, qualities.get(part), exact) for part, sizes in data["parts"].items()]
+    rows.append(_row(WHOLE, whole, qualities.get(WHOLE), exact))
     ratio = whole["exact_bytes"] / whole["compact_bytes"]
     line = f"{data['file']}: {whole['compact_bytes'] / 1e6:.3f} MB, 1/{ratio:.1f} of the exact files"
-    if "splats" in data:
-        count = data["splats"]
-        each = whole["compact_bytes"] / max(count, 1)
-        line += f"; {data['splats_kept']} of {count} splats kept, {each:.1f} bytes for each trained one"
+    if count := data.get("splats"):
+        line += f"; {count} splats, {whole['compact_bytes'] / count:.1f} bytes for each"
     rows.append(line)
     if exact:
-        rows.append(
-            f"Quality on {data['frames']} held-out frames with only one part quantised. Left out: splats that no "
-            "training pose shows are removed, nothing is quantised."
-        )
+        rows.append(f"Quality on {data['frames']} held-out frames with only one part quantised.")
         if exact["psnr"] is not None:
             rows.append(
                 f"Exact avatar: {exact['psnr']:.3f} dB, SSIM {exact['ssim']:.5f}; the table has differences from it."
@@ -156,13 +119,12 @@ def _row(
         row += f"{sizes[name]:>12,}" if name in sizes else f"{'':>12}"
     if quality is None or exact is None:
         return row.rstrip()
-    against = [f"{'':>14}", f"{'':>15}"]
-    if quality["psnr"] is not None and exact["psnr"] is not None:
-        against[0] = f"{quality['psnr'] - exact['psnr']:>+14.3f}"
-    if quality["ssim"] is not None and exact["ssim"] is not None:
-        against[1] = f"{quality['ssim'] - exact['ssim']:>+15.5f}"
+    for name, text in (("psnr", "+14.3f"), ("ssim", "+15.5f")):
+        value, reference = quality[name], exact[name]
+        known = value is not None and reference is not None
+        row += format(value - reference, f">{text}") if known else " " * int(text[1:3])
     to_exact = quality["psnr_exact"]
-    return row + "".join(against) + (f"{'equal':>13}" if to_exact is None else f"{to_exact:>13.2f}")
+    return row + ("equal" if to_exact is None else f"{to_exact:.2f}").rjust(13)
 
 
 class Quality(NamedTuple):

@@ -11,7 +11,7 @@ class Precision:
 
     Each step is in a unit in which equal errors are equally visible, so that one number serves a whole part. With a capture,
     steps are those of a splat of average visibility in the training views, and others have steps in inverse proportion to
-    their visibility (`transform.visibility_classes`). The range of values needs no fixed number of bits because values are
+    their visibility (`coder.visibility_classes`). The range of values needs no fixed number of bits because values are
     entropy-coded. ``headbench export compact --compare`` measures what each costs.
     """
 
@@ -30,20 +30,20 @@ class Precision:
     opacities: float = 0.1
     """Step of opacity logits: an opacity is off by 0.0125 at most."""
 
-    harmonics: float = 0.008
+    harmonics: float = 0.01
     """Step of colours by spherical harmonics, in colour: root mean square over directions, see `colour_metric`."""
 
-    colors: float = 0.008
+    colors: float = 0.01
     """Step of the separate colours of splats, added to those of the planes."""
 
-    planes: float = 0.008
+    planes: float = 0.01
     """Step of the colour contribution of the channels of a plane, in [0, 1], as weighted by the colour network."""
 
-    lines: float = 0.008
+    lines: float = 0.012
     """Step of the offset (logits) by the channels of one line at coefficient 1, as weighted by the offset network.
     Small, since the errors of thousands of channels add up."""
 
-    networks: float = 0.015
+    networks: float = 0.01
     """Step of network weights, relative to the largest weight of the same row: 1/127 would be 8 bits."""
 
     tables: float = 0.2
