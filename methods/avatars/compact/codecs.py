@@ -100,8 +100,7 @@ def encode_avatar(
     found.layout(coder, head, code_subject(coder, head, found.subject))
     assert not coder.left
     text[CODEC] = codec_name(precision)
-    steps = {part: getattr(scaled, part) for part in scaled.parts}
-    return Content(coder.arrays, text, steps), coder.parts
+    return Content(coder.arrays, text, scaled.parts), coder.parts
 
 
 def codec_name(precision: Precision) -> str:

@@ -108,15 +108,13 @@ class Coder:
     def rounded(
         self,
         name: str,
-        step: float,
         part: str,
-        *,
         unit: FloatArray | float = 1.0,
         base: FloatArray | float = 0.0,
         values: FloatArray | None = None,
     ) -> FloatArray:
-        """An array rounded to multiples of ``step * unit`` from ``base``, float32; exact for step 0."""
-        if not step:
+        """An array rounded to multiples of the part's step times ``unit`` from ``base``, float32; exact for step 0."""
+        if not (step := getattr(self.precision, part)):
             return self.exact(name, values, part)
         steps = step * np.asarray(unit, np.float64)
         levels = None
@@ -125,9 +123,7 @@ class Coder:
             levels = _nearest(away / steps)
         return (self.whole(name, levels, part) * steps + base).astype(np.float32)
 
-    def matrix(
-        self, name: str, step: float, part: str = "networks", values: FloatArray | None = None
-    ) -> FloatArray:
+    def matrix(self, name: str, step: float, part: str, values: FloatArray | None = None) -> FloatArray:
         """Weights with a row for each output, rounded relative to the largest of their row."""
         if not step:
             return self.exact(name, values, part)
@@ -145,8 +141,8 @@ class Coder:
     def vectors(
         self,
         name: str,
-        step: float,
         part: str,
+        step: float | None = None,
         *,
         scale: FloatArray | float = 1.0,
         units: FloatArray | None = None,
@@ -161,6 +157,8 @@ class Coder:
 
         Parameters
         ----------
+        step : float | None
+            Step of the root of the visible squared error; by default that of the part.
         scale : FloatArray | float
             (N, 1) factors of the step.
         units : FloatArray | None
@@ -173,6 +171,7 @@ class Coder:
         centred : bool
             Whether the mean is subtracted; without, vectors that round to 0 are decoded as 0.
         """
+        step = getattr(self.precision, part) if step is None else step
         if not step or (units is not None and not units.all()):
             return self.exact(name, values, part)
         basis = mean = chosen = None

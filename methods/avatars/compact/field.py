@@ -24,11 +24,10 @@ def field(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     splats, classes = code_splats(coder, floor=0.02, turned=turned)
     columns = splats | {"opacities": splats["opacities"][:, None], "binding": triangles[:, None]}
     tensors = {"splats": np.concatenate([columns[name] for name in SPLAT_WIDTHS], axis=1).astype(np.float32)}
-    scale, precision = scale_of(classes), coder.precision
     if coder.has("sh_dc", COLOURS):
         tensors |= code_harmonics(coder, classes)
     if coder.has(RESIDUAL):
-        tensors[RESIDUAL] = coder.vectors(RESIDUAL, precision.colors, "colors", scale=scale)
+        tensors[RESIDUAL] = coder.vectors(RESIDUAL, "colors", scale=scale_of(classes))
     if coder.has(PLANES[0]):
         shares = metrics = None
         if coder.source is not None:
@@ -49,7 +48,7 @@ def _plane(coder: Coder, name: str, shares: FloatArray | None, metric: FloatArra
     classes = coder.classes(f"{name}/classes", own if weighted else None, int(used.sum()))
     values = None if coder.source is None else coder.given(name)[used]
     options = {"values": values, "metric": metric, "weights": own}
-    found = coder.vectors(name, coder.precision.planes, "planes", scale=scale_of(classes), **options)
+    found = coder.vectors(name, "planes", scale=scale_of(classes), **options)
     if len(used) * found.shape[1] > MOST_NUMBERS:
         raise ValueError(f"{name} has {len(used)} samples of {found.shape[1]} numbers")
     plane = np.zeros((len(used), found.shape[1]), np.float32)

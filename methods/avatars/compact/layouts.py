@@ -76,11 +76,8 @@ def read_coded(
 def code_subject(coder: Coder, head: HeadAsset, subject: Subject | None = None) -> Subject:
     """Code the subject of an avatar."""
     shape = coder.exact("shape", None if subject is None else subject.shape, "subject")
-    offset = coder.rounded(
-        "static_offset",
-        *(coder.precision.subject, "subject"),
-        values=None if subject is None else subject.static_offset,
-    )
+    own = None if subject is None else subject.static_offset
+    offset = coder.rounded("static_offset", "subject", values=own)
     if shape.shape != (head.shape_basis.shape[2],) or offset.shape != head.template.shape:
         raise ValueError(f"a subject of another head model, shapes {shape.shape} and {offset.shape}")
     if not (np.isfinite(shape).all() and np.isfinite(offset).all()):
@@ -91,8 +88,8 @@ def code_subject(coder: Coder, head: HeadAsset, subject: Subject | None = None) 
 def code_points(coder: Coder, head: HeadAsset, finest: float = 1 / 64) -> tuple[Tensors, SurfacePoints]:
     """Surface points of splats, and their tensors."""
     triangles = coder.whole("triangles", part="triangles")
-    step = finest if coder.precision.positions else 0.0
-    inside = coder.rounded("barycentric", step, "triangles")
+    unit = finest / coder.precision.positions if coder.precision.positions else 1.0
+    inside = coder.rounded("barycentric", "positions", unit)
     if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(head.faces):
         raise ValueError("triangles that the head model does not have")
     tensors = {"triangles": triangles.astype(np.int32), "barycentric": inside}
@@ -121,23 +118,21 @@ def code_splats(
     base : FloatArray | float
         Points to which the means are close.
     """
-    precision, source = coder.precision, coder.source
+    source = coder.source
     count = 0 if source is None else len(source.tensors["log_scales"])
     classes = coder.classes("classes", None if source is None else source.weights, count)
     scale = scale_of(classes, COARSEST_SHAPE)
-    log_scales = coder.rounded("log_scales", precision.scales, "scales", unit=scale)
-    if not turned and precision.rotations:
+    log_scales = coder.rounded("log_scales", "scales", scale)
+    if not turned and coder.precision.rotations:
         imaginary = None if source is None else smallest_three(coder.given("quats"))
-        quats = from_smallest_three(
-            coder.rounded("quats", precision.rotations, "rotations", unit=scale, values=imaginary)
-        )
+        quats = from_smallest_three(coder.rounded("quats", "rotations", scale, values=imaginary))
     else:
-        quats = coder.rounded("quats", precision.rotations, "rotations", unit=scale)
-    opacities = coder.rounded("opacities", precision.opacities, "opacities", unit=scale[:, 0])
+        quats = coder.rounded("quats", "rotations", scale)
+    opacities = coder.rounded("opacities", "opacities", scale[:, 0])
     tensors = {"log_scales": log_scales, "quats": quats, "opacities": opacities}
     if means:
         size = splat_size(log_scales, floor)
-        tensors[means] = coder.rounded(means, precision.positions, "positions", unit=scale * size, base=base)
+        tensors[means] = coder.rounded(means, "positions", scale * size, base)
     return tensors, classes
 
 
@@ -154,9 +149,8 @@ def code_harmonics(coder: Coder, classes: IntArray) -> Tensors:
         dc, rest = coder.given("sh_dc"), coder.given("sh_rest")
         values = np.concatenate([dc[:, :, None], rest], axis=2).reshape(len(dc), -1)
         metric = colour_metric(rest.shape[2] + 1, coder.source.metrics.get("directions"))
-    step, scale = coder.precision.harmonics, scale_of(classes)
-    options = {"scale": scale, "values": values, "metric": metric}
-    joined = coder.vectors(COLOURS, step, "harmonics", **options).reshape(len(classes), 3, -1)
+    options: dict[str, Any] = {"scale": scale_of(classes), "values": values, "metric": metric}
+    joined = coder.vectors(COLOURS, "harmonics", **options).reshape(len(classes), 3, -1)
     return {"sh_dc": joined[:, :, 0], "sh_rest": joined[:, :, 1:]}
 
 
@@ -186,7 +180,9 @@ def code_others(coder: Coder, exact: Sequence[str] = ()) -> Tensors:
             weights = coder.source.tensors[name].ndim > 1 and name not in exact
         else:
             weights = f"{name}/steps" in coder.arrays
-        found[name] = coder.matrix(name, coder.precision.networks) if weights else coder.exact(name)
+        found[name] = (
+            coder.matrix(name, coder.precision.networks, "networks") if weights else coder.exact(name)
+        )
     return found
 
 
@@ -213,7 +209,7 @@ def blended(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     weights = None if coder.source is None or coder.source.weights is None else coder.source.weights[owners]
     scale = scale_of(classes[owners], COARSEST_SHAPE)
     options = {"scale": scale, "units": units, "weights": weights, "centred": False}
-    tensors["differences"] = coder.vectors("differences", DIFFERENCE_STEP, "differences", **options)
+    tensors["differences"] = coder.vectors("differences", "differences", DIFFERENCE_STEP, **options)
     columns = [splats[name].reshape(len(classes), -1) for name in (*GEOMETRY, "sh_rest")]
     tensors["splats"] = np.concatenate(columns, axis=1)
     tensors["moved_by"] = np.packbits(moved_by > 0, axis=1)
@@ -239,7 +235,7 @@ def reduced(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     splats, classes = code_splats(coder, floor=FLOOR)
     colour = None if coder.source is None else C0**2 * np.eye(3)
     options: dict[str, Any] = {"scale": scale_of(classes), "metric": colour}
-    splats["colors"] = coder.vectors("colors", coder.precision.harmonics, "harmonics", **options)
+    splats["colors"] = coder.vectors("colors", "harmonics", **options)
     values = None
     if coder.source is not None:  # (N, K, 10) as (N, 10 K)
         values = np.concatenate([coder.given(name) for name in SHAPES.values()], axis=2)
@@ -247,7 +243,7 @@ def reduced(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     widths = {name: splats[name].shape[1] for name in SHAPES}
     units = _units(coder, splats["log_scales"], widths)
     options = {"scale": scale_of(classes, COARSEST_SHAPE), "units": units, "values": values, "centred": False}
-    found = coder.vectors("shapes", 1.0, "differences", **options)
+    found = coder.vectors("shapes", "differences", 1.0, **options)
     table = found.reshape(len(found), -1, units.shape[1]).swapaxes(0, 1)
     parts = np.split(table, np.cumsum([*widths.values()])[:-1], axis=2)
     return {**tensors, **splats, **dict(zip(SHAPES.values(), parts)), **code_others(coder)}
@@ -265,7 +261,7 @@ def offsets(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
             )
             metric = None if largest is None else np.diag(largest**-2.0)
             options: dict[str, Any] = {"metric": metric, "centred": False}
-            tensors[name] = coder.vectors(name, coder.precision.networks, "networks", **options)
+            tensors[name] = coder.vectors(name, "networks", **options)
     return tensors | code_others(coder)
 
 
@@ -276,7 +272,7 @@ def networks(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     if coder.source is not None:
         metric = np.diag(np.maximum(coder.source.tensors["features"].std(0, dtype=np.float64), 1e-6) ** -2)
     options: dict[str, Any] = {"scale": scale_of(classes), "metric": metric}
-    splats["features"] = coder.vectors("features", coder.precision.tables, "tables", **options)
+    splats["features"] = coder.vectors("features", "tables", **options)
     columns = [splats[name].reshape(len(classes), -1) for name in (*POINTS, "features")]
     return {"table": np.concatenate(columns, axis=1), **code_others(coder, ("landmarks",))}
 
@@ -286,5 +282,5 @@ def grid(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     occupied = coder.whole("occupied").astype(np.uint8)
     spread = None if coder.source is None else coder.source.tensors["table"].std(dtype=np.float64).reshape(1)
     unit = coder.exact("spread", spread, "tables").astype(np.float64)
-    table = coder.rounded("table", coder.precision.tables, "tables", unit=unit)
+    table = coder.rounded("table", "tables", unit)
     return {"occupied": occupied, "table": table, **code_others(coder)}

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from .codecs import DRIVING_FILE, ENCODERS, write_coded
 from .precision import EXACT
 from .settings import CompactSettings
 
+Quality = dict[str, float | None]
+"""PSNR (dB) and SSIM against the ground truth, means over frames, None without one; and ``psnr_exact``, dB against the renders
+of the exact avatar, from the mean squared error over all frames, None if they are equal."""
 WHOLE = "all"
 
 
@@ -34,108 +37,71 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
     Raises `InputError` for a folder without the files of a training, and for the capture of another subject.
     """
     stored, out = open_avatar(Path(settings.avatar)), Path(settings.out)
-    folder = stored.folder
-    exact = stored.load()
+    folder, exact = stored.folder, stored.load()
     if type(exact) not in ENCODERS or any(path.name == COMPACT_FILE for path in exact.files()):
         found = f"an avatar of {stored.record['method']}"
         raise InputError(folder, "", "the files of a trained avatar of a native method", found)
-    head = read_shared_head(folder)
+    head, driving = read_shared_head(folder), folder / DRIVING_FILE
     with TemporaryDirectory() as scratch:
         form = None
         if settings.compare is not None:
-            clip = settings.open(settings.compare, progress)
-            if clip.subject != stored.record["subject"]:
-                raise InputError(
-                    settings.compare, "subject", repr(stored.record["subject"]), repr(clip.subject)
-                )
-            needs = MethodNeeds.of(stored.method.spec)
+            clip, subject = settings.open(settings.compare, progress), stored.record["subject"]
+            if clip.subject != subject:
+                raise InputError(settings.compare, "subject", repr(subject), repr(clip.subject))
+            needs, kept = MethodNeeds.of(stored.method.spec), Path(scratch) / "adapted"
             step = plan(clip, needs, stored.heads)
-            kept = Path(scratch) / "adapted"
             form = AdaptedClip(clip) if step is None else apply(step, needs, kept, f"adapting {clip.subject}")
             comparison = Comparison(clip, form, exact, settings.frames, settings.scale)
         own = None if form is None else form.clip
-        parts = write_coded(exact, head, out, settings.precision, own, folder / DRIVING_FILE)
-        record = stored.record
+        parts = write_coded(exact, head, out, settings.precision, own, driving)
         source = {"of": avatar_digest(folder), "precision": asdict(settings.precision)}
-        shown = record["subject"], record["shape"], record["head_model"]
+        shown = (stored.record[key] for key in ("subject", "shape", "head_model"))
         write_avatar_record(out, stored.method, *shown, "compact", source)
-        whole = {
-            "exact_bytes": sum(path.stat().st_size for path in exact.files()),
-            "compact_bytes": (out / COMPACT_FILE).stat().st_size,
-        }
+        size = sum(path.stat().st_size for path in exact.files())
         data: dict[str, Any] = {"file": out / COMPACT_FILE, "precision": settings.precision}
         if isinstance(exact, SplatAvatar):
             data["splats"] = len(exact.splats(neutral_pose(head)).means)
-        data |= {"whole": whole, "parts": {part: {"compact_bytes": size} for part, size in parts.items()}}
+        data["whole"] = {"exact_bytes": size, "compact_bytes": (out / COMPACT_FILE).stat().st_size}
+        data["parts"] = {part: {"compact_bytes": size} for part, size in parts.items()}
         if own is not None:
-            precision, quality = settings.precision.scaled, {}
-            variants = {
-                n: replace(EXACT, **{n: getattr(precision, n)}) for n in precision.parts if n in parts
-            }
-            for done, (name, variant) in enumerate([*variants.items(), (WHOLE, precision)]):
+            steps = {name: step for name, step in settings.precision.scaled.parts.items() if name in parts}
+            variants = {name: replace(EXACT, **{name: step}) for name, step in steps.items()}
+            quality = {}
+            for done, (name, variant) in enumerate([*variants.items(), (WHOLE, settings.precision)]):
                 progress(done, len(variants) + 1, name)
-                coded = Path(scratch) / "coded"
-                write_coded(exact, head, coded, variant, own, folder / DRIVING_FILE)
-                quality[name] = _plain(comparison(stored.method.create().load(coded, device="cpu")))
-            data |= {"frames": len(comparison.keys), "exact": _plain(comparison.exact), "quality": quality}
+                write_coded(exact, head, Path(scratch) / "coded", variant, own, driving)
+                coded: Avatar = stored.method.create().load(Path(scratch) / "coded", device="cpu")
+                quality[name] = comparison(coded)
+            data |= {"frames": len(comparison.keys), "exact": comparison.exact, "quality": quality}
     return CommandResult(_text(data), data)
 
 
-def _plain(quality: Quality) -> dict[str, float | None]:
-    """The value for JSON: None if it is not a number or infinite."""
-    return {name: value if math.isfinite(value) else None for name, value in quality._asdict().items()}
-
-
 def _text(data: Mapping[str, Any]) -> str:
-    qualities, exact, whole = data.get("quality", {}), data.get("exact"), data["whole"]
-    head = f"{'part':<12}{'exact':>12}{'coded':>12}"
+    exact, whole = data.get("exact"), data["whole"]
+    rows = [f"{'part':<12}{'exact':>12}{'coded':>12}"]
     if exact:
-        head += f"{'dB to truth':>14}{'SSIM to truth':>15}{'dB to exact':>13}"
-    rows = [head]
-    rows += [_row(part, sizes, qualities.get(part), exact) for part, sizes in data["parts"].items()]
-    rows.append(_row(WHOLE, whole, qualities.get(WHOLE), exact))
+        rows[0] += f"{'dB to truth':>14}{'SSIM to truth':>15}{'dB to exact':>13}"
+    for part, sizes in {**data["parts"], WHOLE: whole}.items():
+        row = f"{part:<12}{sizes.get('exact_bytes', ''):>12,}" if part == WHOLE else f"{part:<24}"
+        row += f"{sizes['compact_bytes']:>12,}"
+        quality = data.get("quality", {}).get(part)
+        if exact and quality:
+            for name, width, digits in (("psnr", 14, 3), ("ssim", 15, 5)):
+                known = exact[name] is not None
+                row += f"{f'{quality[name] - exact[name]:+.{digits}f}' if known else '':>{width}}"
+            to_exact = quality["psnr_exact"]
+            row += f"{'equal' if to_exact is None else f'{to_exact:.2f}':>13}"
+        rows.append(row)
     ratio = whole["exact_bytes"] / whole["compact_bytes"]
-    line = f"{data['file']}: {whole['compact_bytes'] / 1e6:.3f} MB, 1/{ratio:.1f} of the exact files"
+    rows.append(f"{data['file']}: {whole['compact_bytes'] / 1e6:.3f} MB, 1/{ratio:.1f} of the exact files")
     if count := data.get("splats"):
-        line += f"; {count} splats, {whole['compact_bytes'] / count:.1f} bytes for each"
-    rows.append(line)
+        rows[-1] += f"; {count} splats, {whole['compact_bytes'] / count:.1f} bytes for each"
     if exact:
         rows.append(f"Quality on {data['frames']} held-out frames with only one part quantised.")
         if exact["psnr"] is not None:
-            rows.append(
-                f"Exact avatar: {exact['psnr']:.3f} dB, SSIM {exact['ssim']:.5f}; the table has differences from it."
-            )
+            quality = f"{exact['psnr']:.3f} dB, SSIM {exact['ssim']:.5f}"
+            rows.append(f"Exact avatar: {quality}; the table has differences from it.")
     return "\n".join(rows)
-
-
-def _row(
-    part: str,
-    sizes: Mapping[str, int],
-    quality: Mapping[str, float | None] | None,
-    exact: Mapping[str, float | None] | None,
-) -> str:
-    row = f"{part:<12}"
-    for name in ("exact_bytes", "compact_bytes"):
-        row += f"{sizes[name]:>12,}" if name in sizes else f"{'':>12}"
-    if quality is None or exact is None:
-        return row.rstrip()
-    for name, text in (("psnr", "+14.3f"), ("ssim", "+15.5f")):
-        value, reference = quality[name], exact[name]
-        known = value is not None and reference is not None
-        row += format(value - reference, f">{text}") if known else " " * int(text[1:3])
-    to_exact = quality["psnr_exact"]
-    return row + ("equal" if to_exact is None else f"{to_exact:.2f}").rjust(13)
-
-
-class Quality(NamedTuple):
-    """Quality of an avatar's renders."""
-
-    psnr: float
-    """dB against the ground truth, mean over frames; NaN without one."""
-    ssim: float
-    """SSIM against the ground truth, mean over frames, with the window used in training."""
-    psnr_exact: float
-    """dB against the renders of the exact avatar, from the mean squared error over all frames; infinite if equal."""
 
 
 class Comparison:
@@ -176,10 +142,12 @@ class Comparison:
         return pictures
 
     def _quality(self, pictures: Sequence[ByteArray]) -> Quality:
-        against_exact = psnr(float(np.mean([squared_error(a, b) for a, b in zip(pictures, self._exact)])))
-        if self._truth is None:
-            return Quality(math.nan, math.nan, against_exact)
-        pairs = list(zip(pictures, self._truth))
-        decibels = [psnr(squared_error(*pair)) for pair in pairs]
-        similarity = [picture_ssim(*pair) for pair in pairs]
-        return Quality(float(np.mean(decibels)), float(np.mean(similarity)), against_exact)
+        to_exact = psnr(float(np.mean([squared_error(a, b) for a, b in zip(pictures, self._exact)])))
+        quality: Quality = {"psnr": None, "ssim": None, "psnr_exact": to_exact}
+        if self._truth is not None:
+            pairs = list(zip(pictures, self._truth))
+            quality["psnr"] = float(np.mean([psnr(squared_error(*pair)) for pair in pairs]))
+            quality["ssim"] = float(np.mean([picture_ssim(*pair) for pair in pairs]))
+        return {
+            name: value if value is None or math.isfinite(value) else None for name, value in quality.items()
+        }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 
 
 @dataclass(frozen=True)
@@ -11,8 +11,7 @@ class Precision:
 
     Each step is in a unit in which equal errors are equally visible, so that one number serves a whole part. With a capture,
     steps are those of a splat of average visibility in the training views, and others have steps in inverse proportion to
-    their visibility (`coder.visibility_classes`). The range of values needs no fixed number of bits because values are
-    entropy-coded. ``headbench export compact --compare`` measures what each costs.
+    their visibility (`coder.visibility_classes`). ``headbench export compact --compare`` measures what each costs.
     """
 
     step: float = 1.0
@@ -53,23 +52,21 @@ class Precision:
     """Step of the subject's static offset, metres."""
 
     def __post_init__(self) -> None:
-        for part in self.parts:
-            step = getattr(self, part)
+        for part, step in self.parts.items():
             if not 0 <= step < 1:
                 raise ValueError(f"{part} must be at least 0 and below 1, found {step}")
         if not 0 < self.step <= MAX_STEP:
             raise ValueError(f"step must be above 0 and at most {MAX_STEP:g}, found {self.step}")
 
     @property
-    def parts(self) -> tuple[str, ...]:
-        """Names of the parts."""
-        return tuple(part.name for part in fields(self) if part.name != "step")
+    def parts(self) -> dict[str, float]:
+        """Steps by part, without the factor."""
+        return {name: step for name, step in asdict(self).items() if name != "step"}
 
     @property
     def scaled(self) -> Precision:
         """The same steps with the factor 1."""
-        steps = {part: min(self.step * getattr(self, part), LARGEST_STEP) for part in self.parts}
-        return Precision(**steps)
+        return Precision(**{part: min(self.step * step, LARGEST_STEP) for part, step in self.parts.items()})
 
 
 MAX_STEP, LARGEST_STEP = 64.0, 0.999
