@@ -5,27 +5,32 @@ All methods share the file, the coder and the steps (`Precision`); they differ o
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from ....bench.contracts import Avatar, Clip, FloatArray, HeadAsset, IntArray, SplatAvatar
+from ....bench.contracts import Avatar, Clip, FloatArray, HeadAsset, SplatAvatar
 from ....bench.errors import InputError
-from ....bench.io.arrays import Member, read_arrays
-from ....bench.io.files import digest, read_bytes
+from ....bench.io.arrays import read_npz
+from ....bench.io.documents import read_json
+from ....bench.io.files import digest
+from ...flashavatar.hyper_gaussians import gaussian_shapes
 from ...flashavatar.method import FlashAvatarAvatar
 from ...ga.method import GAAvatar
 from ...gbs.avatar import GBSAvatar
 from ...gbs.storage import EXPRESSIONS
 from ...gha.avatar import CONFIG, TABLE, GHAAvatar
 from ...gha.gaussian_head import POINTS
-from ...insta.avatar import FIELD_FILE, OCCUPIED, SETTINGS, SETTINGS_FILE, InstaAvatar, read_settings
-from ...insta.field import Architecture
+from ...insta.avatar import FIELD_FILE, SETTINGS, SETTINGS_FILE, InstaAvatar
+from ...ops.harmonics import sh_basis, sh_degree
 from ...ours.avatar import OursAvatar
 from ...ours.storage import DYNAMIC, PER_SPLAT, splat_columns
 from ...rgbavatar.method import RGBAvatarAvatar
@@ -46,15 +51,14 @@ from ...shared.tensor_files import read_safetensors
 from ..views import importance, training_views
 from .coder import Coder, Source, visibility_classes
 from .container import CODEC, Content, write_content
-from .field import field
-from .layouts import Layout, blended, bound, code_subject, grid, networks, offsets, reduced
+from .field import field, field_metrics
+from .layouts import COLOURS, Layout, blended, bound, code_subject, grid, networks, offsets, reduced
 from .precision import Precision
 
 CODEC_VERSION = 4
 """Codec version, increased when the same avatar and steps give different files."""
 DRIVING_FILE = "driving.npz"
 """Driving signal beside the avatars of some methods, which is not part of their size."""
-MAX_SETTINGS = 2**20
 
 
 class Parts(NamedTuple):
@@ -74,100 +78,82 @@ def write_coded(
     With a clip, steps follow the visibility of each splat in its training views. Returns the bytes of each part. Raises
     `InputError` for an avatar of a method that has no codec, and for one that was read from a coded file.
     """
-    content, parts = encode_avatar(avatar, head, precision, clip)
+    parts_of, files = ENCODERS.get(type(avatar)), [*avatar.files()]
+    if parts_of is None or any(path.name == COMPACT_FILE for path in files):
+        found = "a coded one" if parts_of else f"a {type(avatar).__name__}"
+        raise InputError(files[0], "", "a trained avatar of a native method that has a codec", found)
+    layout, source, subject, own = parts_of(avatar, head, clip)
+    person = {"shape": subject.shape, "static_offset": subject.static_offset}
+    # A digest names individual steps that are not the defaults.
+    digest_of = "" if precision.parts == Precision().parts else f" ({digest(precision.parts)[:8]})"
+    codec = f"{CODEC_VERSION}, steps x{precision.step:g}{digest_of}"
+    text = {"name": subject.name, "head_model": subject.head_model, **own, CODEC: codec}
+    coder = Coder(precision.scaled, text, replace(source, tensors={**source.tensors, **person}))
+    layout(coder, head, code_subject(coder, head))
+    assert not coder.left
     save_shared_head(out, head)
     if driving is not None and driving.is_file():
         shutil.copyfile(driving, out / DRIVING_FILE)
     sizes: dict[str, int] = {}
-    for name, size in write_content(out / COMPACT_FILE, content).items():
-        sizes[parts[name]] = sizes.get(parts[name], 0) + size
+    written = write_content(out / COMPACT_FILE, Content(coder.arrays, text, precision.scaled.parts))
+    for name, size in written.items():
+        sizes[coder.parts[name]] = sizes.get(coder.parts[name], 0) + size
     return sizes
 
 
-def encode_avatar(
-    avatar: Avatar, head: HeadAsset, precision: Precision, clip: Clip | None = None
-) -> tuple[Content, dict[str, str]]:
-    """Content of the coded file of an avatar, and the part of each array; see `write_coded`."""
-    parts_of = ENCODERS.get(type(avatar))
-    if parts_of is None:
-        methods = "ours, ga, gbs, gha, insta, rgbavatar or flashavatar"
-        raise InputError("avatar", "", f"one of {methods}", f"a {type(avatar).__name__}")
-    if any(path.name == COMPACT_FILE for path in avatar.files()):
-        raise InputError(avatar.files()[0], "", "the files of a training", "a coded avatar")
-    found, scaled = parts_of(avatar, head, clip), precision.scaled
-    text = {"name": found.subject.name, "head_model": found.subject.head_model, **found.text}
-    coder = Coder(scaled, text, found.source)
-    found.layout(coder, head, code_subject(coder, head, found.subject))
-    assert not coder.left
-    text[CODEC] = codec_name(precision)
-    return Content(coder.arrays, text, scaled.parts), coder.parts
+class _Splats:
+    """Splats of an avatar in the order of the file: by class of visibility, since the values of a class are of similar range, and
+    by triangle. ``rows`` are their indices."""
 
-
-def codec_name(precision: Precision) -> str:
-    """Name of the codec with its steps: "2, steps x1", and a digest of the individual steps if they are not the defaults."""
-    name = f"{CODEC_VERSION}, steps x{precision.step:g}"
-    own = replace(precision, step=1.0)
-    return name if own == Precision() else f"{name} ({digest(asdict(own))[:8]})"
-
-
-class _Order:
-    """Order of splats in the file: by visibility, whose classes have values of similar range, then by place.
-
-    Parameters
-    ----------
-    places : Tensor | np.ndarray
-        (N,) triangles of the splats, or numbers along a curve through space.
-    """
-
-    def __init__(self, avatar: SplatAvatar, clip: Clip | None, places: Tensor | np.ndarray):
+    def __init__(self, avatar: SplatAvatar, clip: Clip | None, triangles: np.ndarray):
         weights = None if clip is None else importance(avatar, training_views(clip))
-        self.rows = np.lexsort((_numpy(places), visibility_classes(weights, len(places))))
+        classes = visibility_classes(weights, len(triangles))
+        self.rows = np.lexsort((triangles, classes))
+        self._classes = classes[self.rows]
         self._weights = None if weights is None else weights[self.rows]
 
     def source(
-        self,
-        splats: Mapping[str, Tensor | np.ndarray],
-        others: Mapping[str, Tensor | np.ndarray],
-        metrics: Mapping[str, FloatArray] | None = None,
+        self, splats: Mapping[str, Any], others: Mapping[str, Any], metrics: Mapping[str, FloatArray]
     ) -> Source:
-        """Source of arrays with a row for each splat, and of others."""
+        """Source of arrays or tensors with a row for each splat, and of others. Harmonics are joined."""
         arrays = {name: _numpy(value)[self.rows] for name, value in splats.items()}
-        return Source(
-            arrays | {n: _numpy(value) for n, value in others.items()}, self._weights, metrics or {}
-        )
+        if "sh_dc" in arrays:
+            dc, rest = arrays.pop("sh_dc"), arrays.pop("sh_rest")
+            arrays[COLOURS] = np.concatenate([dc[:, :, None], rest], axis=2).reshape(len(dc), -1)
+        arrays |= {name: _numpy(value) for name, value in others.items()} | {"classes": self._classes}
+        return Source(arrays, self._weights, metrics)
 
 
 def _numpy(values: Tensor | np.ndarray) -> np.ndarray:
     return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
 
 
-def _morton(points: FloatArray, bits: int = 10) -> IntArray:
-    """Numbers of (N, 3) points along a Morton curve."""
-    low, high = points.min(0, initial=np.inf), points.max(0, initial=-np.inf)
-    cells = ((points - low) / np.maximum(high - low, 1e-12) * (2**bits - 1)).astype(np.int64)
-    return np.asarray(sum(((cells >> bit & 1) << np.arange(3)).sum(1) << 3 * bit for bit in range(bits)))
-
-
 def _ours(avatar: OursAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
     others = dict(avatar.field.tensors)
-    rows = splat_columns(others.pop("splats"))
-    rows |= {name: rows[name][:, 0] for name in ("opacities", "binding")}
-    rows |= {name: others.pop(name) for name in PER_SPLAT if name in others}
-    source = _Order(avatar, clip, rows["binding"]).source(rows, others)
+    splats = splat_columns(others.pop("splats"))
+    splats |= {name: splats[name][:, 0] for name in ("opacities", "binding")}
+    splats |= {name: others.pop(name) for name in PER_SPLAT if name in others}
+    order = _Splats(avatar, clip, _numpy(splats["binding"]))
+    source = order.source(splats, others, field_metrics(avatar.field.tensors))
     return Parts(field, source, avatar.subject, {DYNAMIC: ",".join(avatar.field.dynamic)})
 
 
 def _ga(avatar: GAAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
     metrics = {}
     if clip is not None:
-        # The harmonics are in world space, where the cameras are static.
+        # Harmonics stay in the world. Errors count mostly along the directions from which static cameras see them in training;
+        # a fifth of the weight is that of all directions, for other views.
         views = training_views(clip)
         middle = np.mean(avatar.splats(views[0][1]).means, axis=0)
-        places = {camera.id: camera.center for camera, _ in views}
-        directions = np.stack([middle - place for place in places.values()])
-        metrics["directions"] = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    rows = {**avatar.splat_tensors, "binding": avatar.binding}
-    source = _Order(avatar, clip, avatar.binding).source(rows, {}, metrics)
+        centers = {camera.id: camera.center for camera, _ in views}
+        away = middle - np.stack([*centers.values()])
+        away = away / np.linalg.norm(away, axis=1, keepdims=True)
+        basis = sh_basis(torch.from_numpy(away), sh_degree(avatar.splat_tensors["sh_rest"])).numpy()
+        metric = 0.2 * np.eye(basis.shape[1]) + 0.8 * 4 * np.pi * basis.T @ basis / len(basis)
+        metrics[COLOURS] = np.kron(np.eye(3), metric)
+    splats = {**avatar.splat_tensors, "binding": avatar.binding}
+    splats["quats"] = normalize(splats["quats"], dim=1)
+    source = _Splats(avatar, clip, _numpy(avatar.binding)).source(splats, {}, metrics)
     return Parts(bound, source, avatar.subject)
 
 
@@ -180,48 +166,51 @@ def _gbs(avatar: GBSAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
     owners, moving = _numpy(stored.entries.owners), _numpy(stored.entries.expressions)
     moved_by = np.zeros((len(stored.points.triangles), stored.expressions), np.int64)
     moved_by[owners, moving] = 1
-    order = _Order(avatar, clip, stored.points.triangles)
+    order = _Splats(avatar, clip, stored.points.triangles)
     # Rows of the differences follow the order of the splats.
-    place = np.argsort(order.rows)
-    differences = _numpy(stored.differences)[np.lexsort((moving, place[owners]))]
-    rows = {**stored.neutral, **point_tensors(stored.points), "moved_by": moved_by}
-    others = {"differences": differences, "coefficients": coefficients}
+    rows = np.lexsort((moving, np.argsort(order.rows)[owners]))
+    splats = {**stored.neutral, **point_tensors(stored.points), "moved_by": moved_by}
+    others = {"differences": _numpy(stored.differences)[rows], "coefficients": coefficients}
     text = {EXPRESSIONS: str(stored.expressions)}
-    return Parts(blended, order.source(rows, others), avatar.subject, text)
+    return Parts(blended, order.source(splats, others, {}), avatar.subject, text)
 
 
 def _gha(avatar: GHAAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
     path = next(path for path in avatar.files() if path.name == AVATAR_FILE)
     others, metadata = read_safetensors(path)
-    table = others.pop(TABLE).numpy()
-    columns = np.split(table, np.cumsum([*POINTS.values()]), axis=1)
-    rows = dict(zip((*POINTS, "features"), columns))
-    rows["opacities"] = rows["opacities"][:, 0]
-    source = _Order(avatar, clip, _morton(rows["points"])).source(rows, others)
+    columns = others.pop(TABLE).numpy()
+    splats = dict(zip((*POINTS, "features"), np.split(columns, np.cumsum([*POINTS.values()]), axis=1)))
+    splats["opacities"] = splats["opacities"][:, 0]
+    metrics = {"features": np.diag(np.maximum(splats["features"].std(0, np.float64), 1e-6) ** -2)}
+    source = _Splats(avatar, clip, np.zeros(len(columns))).source(splats, others, metrics)
     return Parts(networks, source, avatar.subject, {CONFIG: metadata[CONFIG]})
 
 
 def _insta(avatar: InstaAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
-    folder = next(path for path in avatar.files() if path.name == FIELD_FILE).parent
-    shapes = Architecture.of(read_settings(folder / SETTINGS_FILE), head.expression_basis.shape[2]).shapes()
-    members = {name: Member("f", shape, dtype="f2") for name, shape in shapes.items()}
-    arrays = read_arrays(folder / FIELD_FILE, {**members, OCCUPIED: Member("u", ("bytes",), dtype="u1")})
-    text = {SETTINGS: read_bytes(folder / SETTINGS_FILE, "settings", MAX_SETTINGS).decode()}
+    folder = avatar.files()[0].parent  # the files that the avatar was read from
+    arrays, text = read_npz(folder / FIELD_FILE), {SETTINGS: json.dumps(read_json(folder / SETTINGS_FILE))}
+    arrays["spread"] = np.maximum(arrays["table"].std(dtype=np.float64), 1e-9).reshape(1)
     return Parts(grid, Source(arrays), read_subject(folder / SUBJECT_FILE, head), text)
 
 
 def _rgbavatar(avatar: RGBAvatarAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
-    metrics = {}
-    if clip is not None:
-        inputs = tracked_inputs(avatar.mesh.arguments(training_poses(clip)), avatar.stored.settings.inputs)
-        found = blend_weights(avatar.stored.tensors, inputs).double().cpu().numpy()
+    stored, metrics = avatar.stored, {}
+    if clip is not None:  # the second moments of the blendshapes' weights in training
+        inputs = tracked_inputs(avatar.mesh.arguments(training_poses(clip)), stored.settings.inputs)
+        found = blend_weights(stored.tensors, inputs).double().cpu().numpy()
         metrics["shapes"] = np.kron(found.T @ found / len(found), np.eye(10))
-    shapes = {name: avatar.stored.tensors[name].swapaxes(0, 1) for name in SHAPES.values()}
-    return _surface(reduced, avatar, head, clip, shapes, metrics)
+    shapes = torch.cat([stored.tensors[name] for name in SHAPES.values()], dim=2)  # (K, N, 10)
+    tensors = {name: value for name, value in stored.tensors.items() if name not in SHAPES.values()}
+    return _surface(
+        reduced, avatar, head, clip, tensors | {"shapes": shapes.transpose(0, 1).flatten(1)}, metrics
+    )
 
 
 def _flashavatar(avatar: FlashAvatarAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
-    return _surface(offsets, avatar, head, clip)
+    tensors, metrics = avatar.stored.tensors, {}
+    for name in filter(tensors.__contains__, gaussian_shapes(1)):
+        metrics[name] = np.diag(np.abs(_numpy(tensors[name])).max(0, initial=1e-6) ** -2.0)
+    return _surface(offsets, avatar, head, clip, tensors, metrics)
 
 
 def _surface(
@@ -229,16 +218,15 @@ def _surface(
     avatar: SurfaceAvatar[Any],
     head: HeadAsset,
     clip: Clip | None,
-    shapes: Mapping[str, Tensor] = {},
-    metrics: Mapping[str, FloatArray] = {},
+    tensors: Mapping[str, Tensor],
+    metrics: Mapping[str, FloatArray],
 ) -> Parts:
-    """Parts of splats on a surface; ``shapes`` are those of its tensors that have splats on the second axis, swapped."""
+    """Parts of splats on a surface; ``shapes`` has a row for each splat, too."""
     stored = avatar.stored
-    widths = stored.shapes(head)
-    rows = {name: value for name, value in stored.tensors.items() if widths[name][0] == "N"}
-    others = {name: value for name, value in stored.tensors.items() if name not in {*rows, *shapes}}
-    rows |= {**shapes, **point_tensors(stored.points)}
-    source = _Order(avatar, clip, stored.points.triangles).source(rows, others, metrics)
+    own = {"shapes", *(name for name, shape in stored.shapes(head).items() if shape[0] == "N")}
+    splats = {name: value for name, value in tensors.items() if name in own} | point_tensors(stored.points)
+    others = {name: value for name, value in tensors.items() if name not in own}
+    source = _Splats(avatar, clip, stored.points.triangles).source(splats, others, metrics)
     return Parts(layout, source, avatar.subject, {stored.KEY: stored.text()})
 
 

@@ -30,26 +30,14 @@ KEY, DATA, VERSION = "compact", "data", 3
 CODEC = "codec"
 """Key of the text that names the codec and its steps, see `CodedAvatar`."""
 MOST_NUMBERS = 2**26
-"""Maximum numbers of all arrays of a file, and of the vectors that one of them is decoded to."""
-
-_FILTERS: list[dict[str, Any]] = [
-    {"id": lzma.FILTER_LZMA1, "preset": 9, "dict_size": 2**20, "lc": 0, "lp": 0, "pb": 0}
-]
+"""Maximum numbers of all arrays of a file."""
+_LZMA: dict[str, Any] = {"id": lzma.FILTER_LZMA1, "preset": 9, "dict_size": 2**20, "lc": 0, "lp": 0, "pb": 0}
 
 
 @dataclass(frozen=True)
 class Entry:
-    """An array in a file.
-
-    Attributes
-    ----------
-    coding : str
-        "float": float32; "whole": whole numbers; "differences": whole numbers as differences from the row before.
-    width : int
-        Bytes of a number before compression.
-    size : int
-        Bytes of the compressed array.
-    """
+    """An array in a file: float32, whole numbers, or whole numbers as differences from the row before; of ``width`` bytes each
+    before compression, and ``size`` bytes altogether after it."""
 
     shape: list[int]
     coding: Literal["float", "whole", "differences"]
@@ -124,47 +112,40 @@ def _header(path: Path, metadata: Mapping[str, str]) -> Header:
 def pack(values: np.ndarray) -> tuple[Entry, bytes]:
     """Compress an array; whole numbers as differences if that is shorter."""
     columns = values.reshape(len(values), -1).T
-    if values.dtype.kind == "f":
-        options: dict[Any, np.ndarray] = {"float": columns.astype("<f4")}
-    else:
-        whole = columns.astype(np.int64)
-        options = {"whole": _narrow(_fold(whole))}
-        options["differences"] = _narrow(_fold(np.diff(whole, axis=1, prepend=0)))
-    streams = {coding: _compressed(numbers) for coding, numbers in options.items()}
-    coding = min(streams, key=lambda each: len(streams[each]))
-    width: Any = options[coding].itemsize
-    return Entry(list(values.shape), coding, width, len(streams[coding])), streams[coding]
+    options: dict[Any, np.ndarray] = {"float": columns.astype("<f4")}
+    if values.dtype.kind != "f":
+        differences = np.diff(columns.astype(np.int64), axis=1, prepend=0)
+        options = {"whole": _folded(columns.astype(np.int64)), "differences": _folded(differences)}
+    packed = []
+    for coding, numbers in options.items():
+        by_significance = np.ascontiguousarray(numbers).view(np.uint8).reshape(-1, numbers.itemsize).T
+        stream = lzma.compress(by_significance.tobytes(), format=lzma.FORMAT_RAW, filters=[_LZMA])
+        width: Any = numbers.itemsize
+        packed.append((Entry(list(values.shape), coding, width, len(stream)), stream))
+    return min(packed, key=lambda pair: pair[0].size)
 
 
 def unpack(entry: Entry, stream: bytes) -> np.ndarray:
     """Inverse of `pack`: float32 or int64. Raises ValueError for a damaged stream and for one of another size."""
-    size = math.prod(entry.shape) * entry.width
-    decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=_FILTERS)
+    size, rows = math.prod(entry.shape) * entry.width, entry.shape[0]
+    decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=[_LZMA])
     data = decoder.decompress(stream, max_length=size + 1)
     if len(data) != size or not decoder.eof or decoder.unused_data:
         raise ValueError(f"a stream of other than {size} bytes")
-    kind = np.dtype("<f4" if entry.coding == "float" else f"<u{entry.width}")
-    by_significance = np.frombuffer(data, np.uint8).reshape(kind.itemsize, -1)
-    numbers = np.ascontiguousarray(by_significance.T).view(kind)
-    rows = entry.shape[0]
+    by_significance = np.frombuffer(data, np.uint8).reshape(entry.width, -1)
+    numbers = np.ascontiguousarray(by_significance.T).view(
+        "<f4" if entry.coding == "float" else f"<u{entry.width}"
+    )
     columns = numbers.reshape(-1, rows) if rows else numbers.reshape(0, 0)
     if entry.coding != "float":
         wide = columns.astype(np.int64)
         columns = np.where(wide % 2 == 1, -(wide + 1) // 2, wide // 2)
-        if entry.coding == "differences":
-            columns = np.cumsum(columns, axis=1)
+        columns = np.cumsum(columns, axis=1) if entry.coding == "differences" else columns
     return np.ascontiguousarray(columns.T).reshape(entry.shape)
 
 
-def _compressed(numbers: np.ndarray) -> bytes:
-    by_significance = np.ascontiguousarray(numbers).view(np.uint8).reshape(-1, numbers.itemsize).T
-    return lzma.compress(by_significance.tobytes(), format=lzma.FORMAT_RAW, filters=_FILTERS)
-
-
-def _fold(whole: IntArray) -> IntArray:
-    return np.where(whole < 0, -2 * whole - 1, 2 * whole)
-
-
-def _narrow(values: IntArray) -> np.ndarray:
-    top = int(values.max(initial=0))
-    return values.astype("<u1" if top < 2**8 else "<u2" if top < 2**16 else "<u4")
+def _folded(whole: IntArray) -> np.ndarray:
+    """Numbers with folded signs in as few bytes as hold them."""
+    folded = np.where(whole < 0, -2 * whole - 1, 2 * whole)
+    top = int(folded.max(initial=0))
+    return folded.astype("<u1" if top < 2**8 else "<u2" if top < 2**16 else "<u4")

@@ -20,26 +20,25 @@ from ...flashavatar.hyper_gaussians import gaussian_shapes
 from ...gbs.blendshapes import difference_widths
 from ...gbs.storage import GEOMETRY
 from ...gha.gaussian_head import POINTS
-from ...ops.harmonics import C0, sh_basis, sh_degree
+from ...ops.harmonics import C0, sh_degree
 from ...rgbavatar.model import SHAPES
 from ...shared.avatar_files import Subject
 from ...shared.subject_mesh import SubjectMesh
 from ...shared.surface_points import SurfacePoints, full_barycentric
-from .coder import Coder, from_smallest_three, scale_of, smallest_three
+from .coder import Coder, scale_of
 from .container import read_content
+from .precision import Precision
 
 Tensors = dict[str, np.ndarray]
 Layout = Callable[[Coder, HeadAsset, Subject], Tensors]
 
 COLOURS = "colours"
-"""Name of the coded harmonics."""
+"""Name of the coded harmonics: (N, 3 K) vectors of the K numbers of each channel."""
 COARSEST_SHAPE = 2
 """Coarsest class of visibility for the shapes of splats: an error of several steps of size or opacity would put a hidden splat
 before visible ones."""
 FLOOR = 5e-5
 """Splats on a surface smaller than this, metres, are placed as finely as one of this size."""
-LARGEST = 80.0
-"""Logarithms are clamped here, so that sizes cannot overflow."""
 DIFFERENCE_STEP = 0.5
 """Step of differences relative to that of the attribute: in a pose, several differences add up."""
 
@@ -56,16 +55,16 @@ def read_coded(
     if version != head.version:
         raise InputError(path, "head_model", repr(head.version), repr(version)[:80])
     try:
-        coder = Coder.of(content)
+        coder = Coder(Precision(**content.steps), content.text, content.arrays)
         subject = code_subject(coder, head)
         with np.errstate(over="ignore", invalid="ignore"):
             tensors = layout(coder, head, subject)
+        if coder.left:
+            raise ValueError(f"further arrays: {', '.join(coder.left)}")
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise InputError(
             path, "", "arrays of a coded avatar that fit each other", repr(error)[:200]
         ) from error
-    if coder.left:
-        raise InputError(path, ", ".join(coder.left)[:80], "no further arrays", "some")
     return (
         subject,
         {name: torch.from_numpy(np.array(values)) for name, values in tensors.items()},
@@ -73,11 +72,10 @@ def read_coded(
     )
 
 
-def code_subject(coder: Coder, head: HeadAsset, subject: Subject | None = None) -> Subject:
+def code_subject(coder: Coder, head: HeadAsset) -> Subject:
     """Code the subject of an avatar."""
-    shape = coder.exact("shape", None if subject is None else subject.shape, "subject")
-    own = None if subject is None else subject.static_offset
-    offset = coder.rounded("static_offset", "subject", values=own)
+    shape = coder.exact("shape", part="subject")
+    offset = coder.rounded("static_offset", "subject")
     if shape.shape != (head.shape_basis.shape[2],) or offset.shape != head.template.shape:
         raise ValueError(f"a subject of another head model, shapes {shape.shape} and {offset.shape}")
     if not (np.isfinite(shape).all() and np.isfinite(offset).all()):
@@ -86,23 +84,17 @@ def code_subject(coder: Coder, head: HeadAsset, subject: Subject | None = None) 
 
 
 def code_points(coder: Coder, head: HeadAsset, finest: float = 1 / 64) -> tuple[Tensors, SurfacePoints]:
-    """Surface points of splats, and their tensors."""
+    """Surface points of splats, rounded to multiples of ``finest`` of a side, and their tensors."""
     triangles = coder.whole("triangles", part="triangles")
-    unit = finest / coder.precision.positions if coder.precision.positions else 1.0
-    inside = coder.rounded("barycentric", "positions", unit)
     if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(head.faces):
         raise ValueError("triangles that the head model does not have")
+    inside = coder.rounded("barycentric", "positions", finest / (coder.precision.positions or 1.0))
     tensors = {"triangles": triangles.astype(np.int32), "barycentric": inside}
     return tensors, SurfacePoints(triangles, full_barycentric(inside))
 
 
 def code_splats(
-    coder: Coder,
-    *,
-    floor: float,
-    turned: bool = True,
-    means: str = "means",
-    base: FloatArray | float = 0.0,
+    coder: Coder, floor: float, means: str = "means", base: FloatArray | float = 0.0
 ) -> tuple[Tensors, IntArray]:
     """Means, log-scales, quaternions and opacities of splats, and their classes of visibility.
 
@@ -110,86 +102,53 @@ def code_splats(
     ----------
     floor : float
         Splats smaller than this are placed as finely as one of this size.
-    turned : bool
-        Whether an expression adds to the quaternions. Then all four components are kept, of any
-        length; otherwise three are enough, see `smallest_three`.
     means : str
         Name of the means; "" if the splats have none.
     base : FloatArray | float
         Points to which the means are close.
     """
-    source = coder.source
-    count = 0 if source is None else len(source.tensors["log_scales"])
-    classes = coder.classes("classes", None if source is None else source.weights, count)
+    classes = coder.whole("classes", part="classes")
     scale = scale_of(classes, COARSEST_SHAPE)
-    log_scales = coder.rounded("log_scales", "scales", scale)
-    if not turned and coder.precision.rotations:
-        imaginary = None if source is None else smallest_three(coder.given("quats"))
-        quats = from_smallest_three(coder.rounded("quats", "rotations", scale, values=imaginary))
-    else:
-        quats = coder.rounded("quats", "rotations", scale)
-    opacities = coder.rounded("opacities", "opacities", scale[:, 0])
-    tensors = {"log_scales": log_scales, "quats": quats, "opacities": opacities}
+    tensors = {"log_scales": coder.rounded("log_scales", "scales", scale)}
+    tensors["opacities"] = coder.rounded("opacities", "opacities", scale[:, 0])
+    tensors["quats"] = coder.rounded("quats", "rotations", scale)
     if means:
-        size = splat_size(log_scales, floor)
-        tensors[means] = coder.rounded(means, "positions", scale * size, base)
+        unit = scale * splat_size(tensors["log_scales"], floor)
+        tensors[means] = coder.rounded(means, "positions", unit, base)
     return tensors, classes
 
 
 def splat_size(log_scales: FloatArray, floor: float) -> FloatArray:
     """(N, 1) geometric mean of the standard deviations of (N, 3) log-scales, at least ``floor``."""
-    mean = log_scales.astype(np.float64).mean(1, keepdims=True)
-    return np.maximum(np.exp(np.minimum(mean, LARGEST)), floor)
+    return np.maximum(np.exp(log_scales.astype(np.float64).mean(1, keepdims=True)), floor)
 
 
 def code_harmonics(coder: Coder, classes: IntArray) -> Tensors:
-    """(N, 3) and (N, 3, K - 1) harmonics, coded by their mean squared colour over directions."""
-    values = metric = None
-    if coder.source is not None:
-        dc, rest = coder.given("sh_dc"), coder.given("sh_rest")
-        values = np.concatenate([dc[:, :, None], rest], axis=2).reshape(len(dc), -1)
-        metric = colour_metric(rest.shape[2] + 1, coder.source.metrics.get("directions"))
-    options: dict[str, Any] = {"scale": scale_of(classes), "values": values, "metric": metric}
-    joined = coder.vectors(COLOURS, "harmonics", **options).reshape(len(classes), 3, -1)
+    """(N, 3) and (N, 3, K - 1) harmonics; by default their error is the mean squared colour over directions."""
+    step = coder.precision.harmonics * math.sqrt(4 * math.pi)
+    joined = coder.vectors(COLOURS, "harmonics", step, scale=scale_of(classes)).reshape(len(classes), 3, -1)
     return {"sh_dc": joined[:, :, 0], "sh_rest": joined[:, :, 1:]}
-
-
-def colour_metric(count: int, directions: FloatArray | None = None) -> FloatArray:
-    """(3 K, 3 K) metric of harmonics of three channels, K = ``count`` numbers each: mean squared colour over directions.
-
-    Parameters
-    ----------
-    directions : FloatArray | None
-        (M, 3) unit vectors along which training views see the splats, if the harmonics stay in the world: four fifths
-        of the weight are theirs, and one fifth is that of the whole sphere, so that other views are kept, too.
-    """
-    whole = np.eye(count) / (4 * np.pi)
-    if directions is not None:
-        basis = sh_basis(torch.from_numpy(np.asarray(directions, np.float64)), math.isqrt(count) - 1).numpy()
-        whole = 0.2 * whole + 0.8 * basis.T @ basis / len(basis)
-    return np.kron(np.eye(3), whole)
 
 
 def code_others(coder: Coder, exact: Sequence[str] = ()) -> Tensors:
     """All other tensors: those of two and more axes are weights of networks, except ``exact``; vectors stay as they are."""
     found = {}
     for name in coder.left:
-        if "/" in name:
+        if name.endswith("/steps"):
             continue
         if coder.source is not None:
             weights = coder.source.tensors[name].ndim > 1 and name not in exact
         else:
-            weights = f"{name}/steps" in coder.arrays
-        found[name] = (
-            coder.matrix(name, coder.precision.networks, "networks") if weights else coder.exact(name)
-        )
+            weights = coder.has(f"{name}/steps")
+        step = coder.precision.networks if weights else 0.0
+        found[name] = coder.matrix(name, "networks" if weights else "other", step)
     return found
 
 
 def bound(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     """Splats bound to triangles, with harmonics: GaussianAvatars."""
     triangles = coder.whole("binding", part="triangles")
-    splats, classes = code_splats(coder, floor=0.02, turned=False)
+    splats, classes = code_splats(coder, 0.02)
     return {"binding": triangles, **splats, **code_harmonics(coder, classes)}
 
 
@@ -198,7 +157,7 @@ def blended(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     tensors, points = code_points(coder, head, 1 / 16)  # positions are relative to the rounded points
     mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
     rest = points.positions(mesh.canonical.numpy(), mesh.faces.numpy()).astype(np.float32)
-    splats, classes = code_splats(coder, floor=FLOOR, base=rest)
+    splats, classes = code_splats(coder, FLOOR, base=rest)
     splats |= code_harmonics(coder, classes)
     moved_by = coder.whole("moved_by", part="differences")
     owners, expressions = np.nonzero(moved_by)
@@ -208,7 +167,7 @@ def blended(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     units = _units(coder, splats["log_scales"], widths)[owners] / coefficients[expressions][:, None]
     weights = None if coder.source is None or coder.source.weights is None else coder.source.weights[owners]
     scale = scale_of(classes[owners], COARSEST_SHAPE)
-    options = {"scale": scale, "units": units, "weights": weights, "centred": False}
+    options: dict[str, Any] = {"scale": scale, "units": units, "weights": weights}
     tensors["differences"] = coder.vectors("differences", "differences", DIFFERENCE_STEP, **options)
     columns = [splats[name].reshape(len(classes), -1) for name in (*GEOMETRY, "sh_rest")]
     tensors["splats"] = np.concatenate(columns, axis=1)
@@ -220,9 +179,7 @@ def _units(coder: Coder, log_scales: FloatArray, widths: Mapping[str, int]) -> F
     """(N, C) steps of changes of attributes of splats; 0 where an attribute is exact."""
     precision = coder.precision
     # A coefficient of harmonics changes colours by C0, root mean square over directions.
-    steps: dict[str, FloatArray | float] = dict.fromkeys(
-        ("sh_dc", "sh_rest", "colors"), precision.harmonics / C0
-    )
+    steps: dict[str, Any] = dict.fromkeys(("sh_dc", "sh_rest", "colors"), precision.harmonics / C0)
     steps["means"] = precision.positions * splat_size(log_scales, FLOOR)
     steps |= {"log_scales": precision.scales, "quats": precision.rotations, "opacities": precision.opacities}
     parts = [np.broadcast_to(steps[name], (len(log_scales), width)) for name, width in widths.items()]
@@ -232,18 +189,12 @@ def _units(coder: Coder, log_scales: FloatArray, widths: Mapping[str, int]) -> F
 def reduced(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     """Splats on a surface with learnt blendshapes: RGBAvatar."""
     tensors, _ = code_points(coder, head)
-    splats, classes = code_splats(coder, floor=FLOOR)
-    colour = None if coder.source is None else C0**2 * np.eye(3)
-    options: dict[str, Any] = {"scale": scale_of(classes), "metric": colour}
-    splats["colors"] = coder.vectors("colors", "harmonics", **options)
-    values = None
-    if coder.source is not None:  # (N, K, 10) as (N, 10 K)
-        values = np.concatenate([coder.given(name) for name in SHAPES.values()], axis=2)
-        values = values.reshape(len(values), -1)
+    splats, classes = code_splats(coder, FLOOR)
+    step = coder.precision.harmonics / C0
+    splats["colors"] = coder.vectors("colors", "harmonics", step, scale=scale_of(classes))
     widths = {name: splats[name].shape[1] for name in SHAPES}
-    units = _units(coder, splats["log_scales"], widths)
-    options = {"scale": scale_of(classes, COARSEST_SHAPE), "units": units, "values": values, "centred": False}
-    found = coder.vectors("shapes", "differences", 1.0, **options)
+    units, scale = _units(coder, splats["log_scales"], widths), scale_of(classes, COARSEST_SHAPE)
+    found = coder.vectors("shapes", "differences", 1.0, scale=scale, units=units)
     table = found.reshape(len(found), -1, units.shape[1]).swapaxes(0, 1)
     parts = np.split(table, np.cumsum([*widths.values()])[:-1], axis=2)
     return {**tensors, **splats, **dict(zip(SHAPES.values(), parts)), **code_others(coder)}
@@ -252,35 +203,23 @@ def reduced(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
 def offsets(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     """Splats that a network translates, rotates and scales: FlashAvatar."""
     tensors, _ = code_points(coder, head)
-    splats, classes = code_splats(coder, floor=FLOOR, means="")
+    splats, classes = code_splats(coder, FLOOR, means="")
     tensors |= splats | code_harmonics(coder, classes)
-    for name in gaussian_shapes(1):  # those of HyperGaussians
-        if coder.has(name):
-            largest = (
-                None if coder.source is None else np.abs(coder.source.tensors[name]).max(0, initial=1e-6)
-            )
-            metric = None if largest is None else np.diag(largest**-2.0)
-            options: dict[str, Any] = {"metric": metric, "centred": False}
-            tensors[name] = coder.vectors(name, "networks", **options)
+    for name in filter(coder.has, gaussian_shapes(1)):  # those of HyperGaussians
+        tensors[name] = coder.vectors(name, "networks")
     return tensors | code_others(coder)
 
 
 def networks(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     """Points with features, and networks: Gaussian Head Avatar."""
-    splats, classes = code_splats(coder, floor=1e-4, means="points")
-    metric = None
-    if coder.source is not None:
-        metric = np.diag(np.maximum(coder.source.tensors["features"].std(0, dtype=np.float64), 1e-6) ** -2)
-    options: dict[str, Any] = {"scale": scale_of(classes), "metric": metric}
-    splats["features"] = coder.vectors("features", "tables", **options)
+    splats, classes = code_splats(coder, 1e-4, means="points")
+    splats["features"] = coder.vectors("features", "tables", scale=scale_of(classes))
     columns = [splats[name].reshape(len(classes), -1) for name in (*POINTS, "features")]
     return {"table": np.concatenate(columns, axis=1), **code_others(coder, ("landmarks",))}
 
 
 def grid(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     """A hash grid with networks, and occupied cells: INSTA."""
-    occupied = coder.whole("occupied").astype(np.uint8)
-    spread = None if coder.source is None else coder.source.tensors["table"].std(dtype=np.float64).reshape(1)
-    unit = coder.exact("spread", spread, "tables").astype(np.float64)
+    occupied, unit = coder.whole("occupied").astype(np.uint8), coder.exact("spread").astype(np.float64)
     table = coder.rounded("table", "tables", unit)
     return {"occupied": occupied, "table": table, **code_others(coder)}

@@ -24,13 +24,13 @@ class Precision:
     """Step of log-scales: 0.04 is an error of at most 2 %."""
 
     rotations: float = 0.018
-    """Step of the three smaller components of unit quaternions: 0.018 is an error of about 0.6 degrees."""
+    """Step of the components of quaternions: 0.018 is an error of about 0.6 degrees."""
 
     opacities: float = 0.1
     """Step of opacity logits: an opacity is off by 0.0125 at most."""
 
     harmonics: float = 0.01
-    """Step of colours by spherical harmonics, in colour: root mean square over directions, see `colour_metric`."""
+    """Step of colours by spherical harmonics, in colour: root mean square over directions."""
 
     colors: float = 0.01
     """Step of the separate colours of splats, added to those of the planes."""
@@ -39,11 +39,10 @@ class Precision:
     """Step of the colour contribution of the channels of a plane, in [0, 1], as weighted by the colour network."""
 
     lines: float = 0.012
-    """Step of the offset (logits) by the channels of one line at coefficient 1, as weighted by the offset network.
-    Small, since the errors of thousands of channels add up."""
+    """Step of the offset (logits) by the channels of one line at coefficient 1, as weighted by the offset network."""
 
     networks: float = 0.01
-    """Step of network weights, relative to the largest weight of the same row: 1/127 would be 8 bits."""
+    """Step of network weights, relative to the largest weight of the same output: 1/127 would be 8 bits."""
 
     tables: float = 0.2
     """Step of trained features (of a hash grid, or of splats that a network shades), in their standard deviation."""
