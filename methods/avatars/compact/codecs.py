@@ -132,6 +132,8 @@ def _ours(avatar: OursAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
     others = dict(avatar.field.tensors)
     splats = splat_columns(others.pop("splats"))
     splats |= {name: splats[name][:, 0] for name in ("opacities", "binding")}
+    if "rotation" not in avatar.field.dynamic:  # which is added to quaternions of any length
+        splats["quats"] = normalize(splats["quats"], dim=1)
     splats |= {name: others.pop(name) for name in PER_SPLAT if name in others}
     order = _Splats(avatar, clip, _numpy(splats["binding"]))
     source = order.source(splats, others, field_metrics(avatar.field.tensors))

@@ -50,12 +50,8 @@ class Coder:
     """Encodes arrays of a `Source`, or decodes those of a file.
 
     ``values`` of a call are encoded instead of the array of that name in the source. Decoding raises KeyError for a missing
-    array and ValueError for arrays that do not fit each other.
-
-    Attributes
-    ----------
-    parts : dict[str, str]
-        Part of the file of each array that was encoded: a name of a step of `Precision`, or "other".
+    array and ValueError for arrays that do not fit each other. ``parts`` has the part of each encoded array: a name of a step of
+    `Precision`, or "other".
     """
 
     def __init__(
@@ -96,14 +92,15 @@ class Coder:
         return self.arrays[name]
 
     def _floats(self, name: str, values: np.ndarray | None, part: str) -> FloatArray:
-        return self._pass(name, None if values is None else values.astype(np.float32), part).astype(
-            np.float32
-        )
+        found = self._pass(name, None if values is None else values.astype(np.float32), part)
+        if found.dtype.kind != "f":
+            raise ValueError(f"{name} has whole numbers")
+        return found
 
     def _levels(self, name: str, values: np.ndarray | None, part: str) -> IntArray:
         """Whole numbers below 2^30; others are rounded."""
         if values is not None:
-            values = np.rint(values).clip(-(2**30), 2**30 - 1).astype(np.int64)
+            values = np.rint(values.astype(np.float64)).clip(-(2**30), 2**30 - 1).astype(np.int64)
         found = self._pass(name, values, part)
         if found.dtype.kind != "i":
             raise ValueError(f"{name} has no whole numbers")
@@ -130,7 +127,7 @@ class Coder:
             return self.exact(name, values, part)
         found, steps = self._values(name, values), step * np.asarray(unit, np.float64)
         found = None if found is None else (found.astype(np.float64) - base) / steps
-        return (self._levels(name, found, part) * steps + base).astype(np.float32)
+        return (_times(self._levels(name, found, part), steps) + base).astype(np.float32)
 
     def matrix(self, name: str, part: str, step: float, values: FloatArray | None = None) -> FloatArray:
         """Weights with a row for each output, rounded relative to the largest of their row; exact for step 0."""
@@ -142,7 +139,8 @@ class Coder:
             largest = step * np.abs(found).max(tuple(range(1, found.ndim)), initial=0, keepdims=True)
             steps = np.where(largest > 0, largest, 1.0)
         steps = self._floats(f"{name}/steps", steps, part).astype(np.float64)
-        return (self._levels(name, None if found is None else found / steps, part) * steps).astype(np.float32)
+        levels = self._levels(name, None if found is None else found / steps, part)
+        return _times(levels, steps).astype(np.float32)
 
     def vectors(
         self,
@@ -182,8 +180,14 @@ class Coder:
                 shares = np.ones(len(given))
             basis, chosen = _transformed(given, metric, shares / max(shares.sum(), 1e-30), step * scale)
         basis = self.matrix(f"{name}/basis", part, BASIS_STEP, basis).astype(np.float64)
-        found = self._levels(name, chosen, part) * (step * scale) @ basis
+        found = _times(self._levels(name, chosen, part), step * scale) @ basis
         return (found * _columns(units, found.shape[1])).astype(np.float32)
+
+
+def _times(levels: IntArray, steps: FloatArray | float) -> FloatArray:
+    if np.ndim(steps) and np.shape(steps)[0] != len(levels):
+        raise ValueError(f"{len(levels)} rows of numbers, but {np.shape(steps)[0]} of steps")
+    return levels * np.asarray(steps)
 
 
 def _columns(units: FloatArray | None, count: int) -> FloatArray | float:

@@ -111,7 +111,7 @@ def _header(path: Path, metadata: Mapping[str, str]) -> Header:
 
 def pack(values: np.ndarray) -> tuple[Entry, bytes]:
     """Compress an array; whole numbers as differences if that is shorter."""
-    columns = values.reshape(len(values), -1).T
+    columns = values.reshape(len(values), math.prod(values.shape[1:])).T
     options: dict[Any, np.ndarray] = {"float": columns.astype("<f4")}
     if values.dtype.kind != "f":
         differences = np.diff(columns.astype(np.int64), axis=1, prepend=0)

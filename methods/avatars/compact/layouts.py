@@ -56,6 +56,8 @@ def read_coded(
         raise InputError(path, "head_model", repr(head.version), repr(version)[:80])
     try:
         coder = Coder(Precision(**content.steps), content.text, content.arrays)
+        if coder.precision.parts != content.steps:
+            raise ValueError("steps of other parts")
         subject = code_subject(coder, head)
         with np.errstate(over="ignore", invalid="ignore"):
             tensors = layout(coder, head, subject)
@@ -98,14 +100,8 @@ def code_splats(
 ) -> tuple[Tensors, IntArray]:
     """Means, log-scales, quaternions and opacities of splats, and their classes of visibility.
 
-    Parameters
-    ----------
-    floor : float
-        Splats smaller than this are placed as finely as one of this size.
-    means : str
-        Name of the means; "" if the splats have none.
-    base : FloatArray | float
-        Points to which the means are close.
+    Splats smaller than ``floor`` are placed as finely as one of this size. ``means`` is the name of the means, "" if there are
+    none, and ``base`` are points to which they are close.
     """
     classes = coder.whole("classes", part="classes")
     scale = scale_of(classes, COARSEST_SHAPE)
@@ -220,6 +216,5 @@ def networks(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
 
 def grid(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     """A hash grid with networks, and occupied cells: INSTA."""
-    occupied, unit = coder.whole("occupied").astype(np.uint8), coder.exact("spread").astype(np.float64)
-    table = coder.rounded("table", "tables", unit)
-    return {"occupied": occupied, "table": table, **code_others(coder)}
+    table = coder.rounded("table", "tables", coder.exact("spread").item())
+    return {"occupied": coder.whole("occupied").astype(np.uint8), "table": table, **code_others(coder)}
