@@ -132,7 +132,7 @@ def alive(pid):
 
 
 @pytest.mark.parametrize("name", ["ga", "rgbavatar"])
-def test_a_training_that_is_killed_or_too_long_ends_its_processes(method, clip, behave, tmp_path, name):
+def test_a_killed_or_too_long_training_ends_its_processes(method, clip, behave, tmp_path, name):
     frames = len(clip.splits["train"])
 
     def kill(done, total, note=""):
