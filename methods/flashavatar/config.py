@@ -61,8 +61,11 @@ class FlashAvatarConfig(SurfaceSettings, HarmonicsTraining):
         super().__post_init__()
         HarmonicsTraining.__post_init__(self)
         check_at_least_one(self, "layers")
-        if not 0 < self.offset_m:
-            raise ValueError(f"offset_m must be above 0, found {self.offset_m}")
-        for name in ("frequencies", "hyper_gaussians", "mouth_weight", "ssim_weight"):
-            if not 0 <= getattr(self, name):
-                raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")
+        bounds = {"frequencies": 16, "layers": 100, "hidden": 1_024, "hyper_gaussians": 128}
+        for name, most in bounds.items():
+            if not 0 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} must be 0 to {most}, found {getattr(self, name)}")
+        if not 0 < self.offset_m <= 100:
+            raise ValueError(f"offset_m must be above 0 and up to 100, found {self.offset_m}")
+        if not 0 <= self.mouth_weight or not 0 <= self.ssim_weight:
+            raise ValueError("mouth_weight and ssim_weight must not be negative")

@@ -158,7 +158,7 @@ class GHAOfficial(OfficialMethod[GHAOfficialConfig]):
         side = max(_side(folder), square_side(frame.camera for frame in frames))
         renders = work.model / self.render_folder
         renders.mkdir(parents=True)
-        parts = []
+        parts: list[dict[str, Any]] = []
         for place, numbers in write_list(frames, tracking, side, work):
             config = {
                 "gpu_id": 0,

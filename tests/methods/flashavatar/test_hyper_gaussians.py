@@ -147,10 +147,10 @@ def test_damaged_gaussians_are_refused(trained, clip, tmp_path):
     for change in ({name: broken}, {name: tensors[name][:, :3].clone()}):
         save_file({**tensors, **change}, path, metadata)
         with pytest.raises(InputError, match=name):
-            TrainedSplats.read(path, clip.head, "cpu")
+            TrainedSplats.of(path, *read_safetensors(path), clip.head, "cpu")
     save_file({key: value for key, value in tensors.items() if key != name}, path, metadata)
     with pytest.raises(InputError, match=name):
-        TrainedSplats.read(path, clip.head, "cpu")
+        TrainedSplats.of(path, *read_safetensors(path), clip.head, "cpu")
 
 
 @pytest.mark.parametrize("latent", [-1, 129])

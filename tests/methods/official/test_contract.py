@@ -16,7 +16,6 @@ from headbench.bench.engine.guard import TrainingView
 from headbench.bench.engine.stored import avatar_digest
 from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json
-from headbench.bench.io.files import grouped_writes
 from headbench.bench.process import ProgramError
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
 from headbench.methods.official import checkout, needs, spec
@@ -133,7 +132,7 @@ def alive(pid):
 
 
 @pytest.mark.parametrize("name", ["ga", "rgbavatar"])
-def test_a_training_that_is_killed_or_too_long_ends_its_processes(method, clip, behave, tmp_path, name):
+def test_a_killed_or_too_long_training_ends_its_processes(method, clip, behave, tmp_path, name):
     frames = len(clip.splits["train"])
 
     def kill(done, total, note=""):
@@ -230,8 +229,7 @@ def test_frames_come_back_under_their_keys(name, avatar, clip, tmp_path, monkeyp
     wanted, several = views(clip, "novel_view", "self_reenactment", "train"), name in (*OF_VIDEO, "insta")
     wanted, before = with_an_odd_size(wanted) if several else wanted, avatar_digest(tmp_path / "avatar")
     for ground in (WHITE, GREEN)[: 1 + (name in COVERED)]:
-        with grouped_writes():
-            found = rendered(avatar, wanted, ground)
+        found = rendered(avatar, wanted, ground)
         for key, (camera, pose) in wanted.items():
             rgb, alpha = found[key]
             most, share = (153, 0.4) if name in COVERED else (255, 0.0)

@@ -29,7 +29,7 @@ def test_words_may_start_the_program(method):
     assert found.python[1:] == ("A=1", f"{method.config.checkout}/build/rta")
 
 
-def test_the_test_split_is_a_pixel_and_equal_meshes_are_written_once(exported):
+def test_equal_meshes_are_written_once(exported):
     work, images = exported
     (last,) = read_json(work.input / "transforms_test.json")["frames"]
     assert cv2.imread(str(work.input / last["file_path"]), -1).tolist() == [[[0, 0, 0, 0]]]

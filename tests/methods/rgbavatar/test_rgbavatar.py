@@ -21,7 +21,7 @@ from headbench.methods.shared.networks import initial_network, input_count, trac
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
 from headbench.methods.shared.surface_points import point_tensors, poisson_disk
-from headbench.methods.shared.tensor_files import write_tensors
+from headbench.methods.shared.tensor_files import read_safetensors, write_tensors
 from headbench.methods.splats import pixel_weights, rasterize
 
 SMALL = {"samples": 400, "hidden": 8, "blendshapes": 3, "schedule_length": 40, "join": 4}
@@ -303,7 +303,7 @@ def test_files_that_do_not_fit_are_refused(clip, head, tmp_path):
     training.close()
     path = tmp_path / AVATAR_FILE
     stored.write(path)
-    again = StoredShapes.read(path, head, "cpu")
+    again = StoredShapes.of(path, *read_safetensors(path), head, "cpu")
     assert all(torch.equal(again.tensors[name], value) for name, value in stored.tensors.items())
     broken = {
         "triangles": replace(
@@ -317,11 +317,11 @@ def test_files_that_do_not_fit_are_refused(clip, head, tmp_path):
     for text in ("expression,smile", "expression;frame_variant=skewed"):
         write_tensors(path, stored.tensors | point_tensors(stored.points), {"inputs": text})
         with pytest.raises(InputError, match="inputs|frame_variant"):
-            StoredShapes.read(path, head, "cpu")
+            StoredShapes.of(path, *read_safetensors(path), head, "cpu")
     for name, each in broken.items():
         each.write(path)
         with pytest.raises(InputError, match=name):
-            StoredShapes.read(path, head, "cpu")
+            StoredShapes.of(path, *read_safetensors(path), head, "cpu")
 
 
 def test_official_colours_are_set_after_the_step(clip):
