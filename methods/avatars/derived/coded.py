@@ -24,7 +24,7 @@ def coded_name(step: float) -> str:
 
 def coded_summary(step: float) -> str:
     """Description of that variant."""
-    return "quantised by visible effect, entropy-coded" + (f", steps times {step:g}" if step != 1 else "")
+    return "quantised by visible effect, compressed" + (f", steps times {step:g}" if step != 1 else "")
 
 
 def _variants(module: str, name: str, folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
