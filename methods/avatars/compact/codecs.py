@@ -70,19 +70,26 @@ class Parts(NamedTuple):
     text: Mapping[str, str] = {}
 
 
-def write_coded(
-    avatar: Avatar, head: HeadAsset, out: Path, precision: Precision, clip: Clip | None, driving: Path | None
-) -> dict[str, int]:
-    """Write the coded avatar, its head model and, if there is one, the file of its ``driving`` signal into a folder.
+def parts_of(avatar: Avatar, head: HeadAsset, clip: Clip | None) -> Parts:
+    """What `write_coded` encodes. With a clip, steps follow the visibility of each splat in its training views.
 
-    With a clip, steps follow the visibility of each splat in its training views. Returns the bytes of each part. Raises
-    `InputError` for an avatar of a method that has no codec, and for one that was read from a coded file.
+    Raises `InputError` for an avatar of a method that has no codec, and for one that was read from a coded file.
     """
-    parts_of, files = ENCODERS.get(type(avatar)), [*avatar.files()]
-    if parts_of is None or any(path.name == COMPACT_FILE for path in files):
-        found = "a coded one" if parts_of else f"a {type(avatar).__name__}"
+    encoder, files = ENCODERS.get(type(avatar)), [*avatar.files()]
+    if encoder is None or any(path.name == COMPACT_FILE for path in files):
+        found = "a coded one" if encoder else f"a {type(avatar).__name__}"
         raise InputError(files[0], "", "a trained avatar of a native method that has a codec", found)
-    layout, source, subject, own = parts_of(avatar, head, clip)
+    return encoder(avatar, head, clip)
+
+
+def write_coded(
+    parts: Parts, head: HeadAsset, out: Path, precision: Precision, driving: Path | None
+) -> dict[str, int]:
+    """Write a coded avatar, its head model and, if there is one, the file of its ``driving`` signal into a folder.
+
+    Returns the bytes of each part of `Precision`.
+    """
+    layout, source, subject, own = parts
     person = {"shape": subject.shape, "static_offset": subject.static_offset}
     # A digest names individual steps that are not the defaults.
     digest_of = "" if precision.parts == Precision().parts else f" ({digest(precision.parts)[:8]})"

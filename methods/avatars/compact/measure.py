@@ -21,7 +21,7 @@ from ....bench.specs import CommandResult
 from ...shared.avatar_files import COMPACT_FILE, read_shared_head
 from ...shared.losses import picture_ssim, psnr, squared_error
 from ..export import neutral_pose
-from .codecs import DRIVING_FILE, write_coded
+from .codecs import DRIVING_FILE, parts_of, write_coded
 from .precision import EXACT
 from .settings import CompactSettings
 
@@ -50,7 +50,8 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
             form = AdaptedClip(clip) if step is None else apply(step, needs, kept, f"adapting {clip.subject}")
             comparison = Comparison(clip, form, exact, settings.frames, settings.scale)
         own = None if form is None else form.clip
-        parts = write_coded(exact, head, out, settings.precision, own, driving)
+        prepared = parts_of(exact, head, own)
+        parts = write_coded(prepared, head, out, settings.precision, driving)
         source = {"of": avatar_digest(folder), "precision": asdict(settings.precision)}
         record = stored.record
         identity = record["subject"], record["shape"], record["head_model"]
@@ -67,7 +68,7 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
             quality = {}
             for done, (name, variant) in enumerate([*variants.items(), (WHOLE, settings.precision)]):
                 progress(done, len(variants) + 1, name)
-                write_coded(exact, head, Path(scratch) / "coded", variant, own, driving)
+                write_coded(prepared, head, Path(scratch) / "coded", variant, driving)
                 coded: Avatar = stored.method.create().load(Path(scratch) / "coded", device="cpu")
                 quality[name] = comparison(coded)
             data |= {"frames": len(comparison.keys), "exact": comparison.exact, "quality": quality}
@@ -76,10 +77,8 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
 
 def _text(data: Mapping[str, Any]) -> str:
     exact, whole = data.get("exact"), data["whole"]
-    rows = [
-        f"{'part':<12}{'bytes':>12}"
-        + f"{'dB to truth':>14}{'SSIM to truth':>15}{'dB to exact':>13}" * bool(exact)
-    ]
+    columns = f"{'dB to truth':>14}{'SSIM to truth':>15}{'dB to exact':>13}" if exact else ""
+    rows = [f"{'part':<12}{'bytes':>12}{columns}"]
     for part, sizes in {**data["parts"], WHOLE: whole}.items():
         rows.append(f"{part:<12}{sizes['compact_bytes']:>12,}")
         quality = data.get("quality", {}).get(part)
@@ -101,17 +100,8 @@ def _text(data: Mapping[str, Any]) -> str:
 
 
 class Comparison:
-    """Held-out frames of a clip: renders of the exact avatar, and ground truth.
-
-    Parameters
-    ----------
-    form : AdaptedClip
-        The clip adapted to the method, whose poses animate the avatar.
-    frames : int
-        Number of frames, spread evenly over both held-out splits.
-    scale : int
-        Enlargement of the renders; above 1 there is no ground truth.
-    """
+    """Renders of the exact avatar and ground truth of a number of held-out ``frames``, spread evenly over both splits. ``form`` is
+    the clip adapted to the method; with an enlargement by ``scale`` above 1 there is no ground truth."""
 
     def __init__(self, clip: Clip, form: AdaptedClip, exact: Avatar, frames: int, scale: int = 1):
         self._clip, self._form, self._scale = clip, form, scale

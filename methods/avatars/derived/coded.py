@@ -44,9 +44,9 @@ flashavatar_variants = partial(_variants, "flashavatar.method", "FlashAvatarAvat
 
 def make_coded(avatar_class: Any, folder: Path, clip: Clip, device: str, step: float, out: Path) -> Avatar:
     """Write the coded form of the avatar of a folder; return the avatar that is read back."""
-    from ..compact.codecs import DRIVING_FILE, write_coded
+    from ..compact.codecs import DRIVING_FILE, parts_of, write_coded
 
     avatar, head = avatar_class.read(folder, "cpu"), read_shared_head(folder)
-    write_coded(avatar, head, out, Precision(step=step), clip, folder / DRIVING_FILE)
+    write_coded(parts_of(avatar, head, clip), head, out, Precision(step=step), folder / DRIVING_FILE)
     coded: Avatar = avatar_class.read(out, device)
     return coded

@@ -23,7 +23,7 @@ from ...shared.avatar_files import (
     write_subject,
 )
 from ...shared.subject_mesh import SubjectMesh
-from ..compact.codecs import write_coded
+from ..compact.codecs import parts_of, write_coded
 from ..compact.precision import Precision
 from ..views import training_views
 from .recipes import GA, Recipe, contributions, kept_rows, read_reduced, write_reduced
@@ -59,7 +59,7 @@ def _make(
     stored = [out / COMPACT_FILE]
     if recipe.storage == "coded":
         reduced = GAAvatar([], whole.mesh, subject, splats, binding, whole.refined, device)
-        write_coded(reduced, head, out, Precision(step=recipe.step), clip, None)
+        write_coded(parts_of(reduced, head, clip), head, out, Precision(step=recipe.step), None)
         coded = GAAvatar.read(out, device)
         subject, splats, binding = coded.subject, coded.splat_tensors, coded.binding
     else:

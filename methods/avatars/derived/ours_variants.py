@@ -21,7 +21,7 @@ from ...shared.avatar_files import (
     write_subject,
 )
 from ...shared.subject_mesh import SubjectMesh
-from ..compact.codecs import write_coded
+from ..compact.codecs import parts_of, write_coded
 from ..compact.precision import Precision
 from ..views import training_views
 from .recipes import (
@@ -84,7 +84,7 @@ def _make(
     subject, stored = whole.subject, [out / COMPACT_FILE]
     if recipe.storage == "coded":
         reduced = OursAvatar([], whole.mesh, subject, field, device)
-        write_coded(reduced, head, out, Precision(step=recipe.step), clip, None)
+        write_coded(parts_of(reduced, head, clip), head, out, Precision(step=recipe.step), None)
         coded = OursAvatar.read(out, device)
         subject, field = coded.subject, coded.field
     else:

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.head.rotations import axis_angle_to_matrix
-from headbench.methods.avatars.compact.codecs import write_coded
+from headbench.methods.avatars.compact.codecs import parts_of, write_coded
 from headbench.methods.avatars.compact.precision import EXACT
 from headbench.methods.ops.harmonics import C0
 from headbench.methods.rgbavatar.config import INPUTS, RGBAvatarConfig
@@ -156,7 +156,7 @@ def test_files_tell_the_axes_of_their_splats(clip, tmp_path):
     avatar = method.fit(clip, tmp_path, Budget(8), device="cpu", seed=0, progress=no_progress)
     assert avatar.stored.text().endswith("translation;frame_variant=official")
     coded = tmp_path / "coded"
-    write_coded(avatar, clip.head, coded, EXACT, None, tmp_path / "driving.npz")
+    write_coded(parts_of(avatar, clip.head, None), clip.head, coded, EXACT, tmp_path / "driving.npz")
     means = avatar.splats(clip.poses[1]).means
     for other in (method.load(tmp_path, device="cpu"), method.load(coded, device="cpu")):
         assert other.stored.settings.frame_variant == "official"

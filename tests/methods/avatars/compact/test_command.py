@@ -1,33 +1,24 @@
 """``headbench export compact`` on an avatar trained on a capture on disk."""
 
+import json
 import re
+import shutil
 
 import pytest
 
-from headbench.bench.contracts import Budget, no_progress
-from headbench.bench.engine.stored import load_avatar
+from headbench.bench.engine.stored import avatar_folder, load_avatar
 from headbench.bench.errors import InputError
-from headbench.datasets.ga.reader import read_capture
 from headbench.methods.avatars.compact.measure import compact_avatar
 from headbench.methods.avatars.compact.settings import CompactSettings
-from headbench.methods.ours.method import Ours
-from headbench.methods.shared.config import SplatTraining
 
-from ....datasets.tiny_capture import make_plan, write_tiny_capture
-from ...ours.toy import SMALL, changed
-from ...recorded import recorded
+from ....world import finished
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def trained():
     """Capture and folder of an avatar."""
-    root = tmp_path_factory.mktemp("compact")
-    capture = write_tiny_capture(root / "capture").union
-    settings = {"penalty": {"weight": 0.0}, "sampling": {"balanced": False}}
-    method = Ours(changed(SMALL, splats=SplatTraining(min_settle=4), **settings))
-    clip, budget = read_capture(capture), Budget(iterations=12)
-    method.fit(clip, root / "avatar", budget, device="cpu", seed=0, progress=no_progress)
-    return capture, recorded(root / "avatar", "ours", clip, method.config)
+    run = finished()
+    return run.read_manifest().configuration.data, avatar_folder(run.cell("901", "ours", 0).folder)
 
 
 @pytest.mark.parametrize("scale", [1, 2])
@@ -63,7 +54,10 @@ def test_without_a_capture_only_sizes_are_measured(trained, tmp_path, cell):
 
 
 def test_the_capture_of_another_subject_is_refused(trained, tmp_path):
-    other = write_tiny_capture(tmp_path / "other", make_plan(subject="902")).union
-    with pytest.raises(InputError, match="902"):
-        compact_avatar(CompactSettings(str(trained[1]), out=str(tmp_path / "out"), compare=str(other)))
+    capture, avatar = trained
+    other = shutil.copytree(avatar, tmp_path / "other")
+    record = json.loads((other / "avatar.json").read_text())
+    (other / "avatar.json").write_text(json.dumps({**record, "subject": "902"}))
+    with pytest.raises(InputError, match="subject: expected '902', found '901'"):
+        compact_avatar(CompactSettings(str(other), out=str(tmp_path / "out"), compare=str(capture)))
     assert not (tmp_path / "out").exists()

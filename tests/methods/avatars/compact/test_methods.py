@@ -7,7 +7,7 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.registry import get, resolve
 from headbench.methods.avatars.compact import layouts
-from headbench.methods.avatars.compact.codecs import write_coded
+from headbench.methods.avatars.compact.codecs import parts_of, write_coded
 from headbench.methods.avatars.compact.container import Content, read_content
 from headbench.methods.avatars.compact.precision import EXACT, Precision
 from headbench.methods.avatars.derived.coded import STEPS, coded_name
@@ -69,7 +69,9 @@ def test_coded_avatars_are_smaller_and_near(trained, clip, tmp_path):
     method, folder, whole = trained
     head, truth, errors, sizes = read_shared_head(folder), pictures(whole, clip), [], [size(whole)]
     for step in (1.0, 8.0):
-        parts = write_coded(whole, head, tmp_path, Precision(step=step), clip, folder / "driving.npz")
+        parts = write_coded(
+            parts_of(whole, head, clip), head, tmp_path, Precision(step=step), folder / "driving.npz"
+        )
         avatar = method.load(tmp_path, device="cpu")
         assert [path.name for path in avatar.files()] == [COMPACT_FILE]
         assert avatar.codec == f"4, steps x{step:g}"
@@ -81,7 +83,7 @@ def test_coded_avatars_are_smaller_and_near(trained, clip, tmp_path):
         np.testing.assert_array_equal(
             pictures(method.load(tmp_path, device="cpu"), clip), pictures(avatar, clip)
         )
-        write_coded(whole, head, tmp_path, Precision(step=step), clip, None)
+        write_coded(parts_of(whole, head, clip), head, tmp_path, Precision(step=step), None)
         assert (tmp_path / COMPACT_FILE).read_bytes() == first
     assert errors[0] < errors[1]
     assert -10 * np.log10(errors[0]) > 33
@@ -89,14 +91,26 @@ def test_coded_avatars_are_smaller_and_near(trained, clip, tmp_path):
 
 def test_without_rounding_nothing_changes(trained, clip, tmp_path):
     method, folder, whole = trained
-    write_coded(whole, read_shared_head(folder), tmp_path, EXACT, None, folder / "driving.npz")
+    write_coded(
+        parts_of(whole, read_shared_head(folder), None),
+        read_shared_head(folder),
+        tmp_path,
+        EXACT,
+        folder / "driving.npz",
+    )
     after = method.load(tmp_path, device="cpu")
     np.testing.assert_allclose(pictures(after, clip), pictures(whole, clip), atol=2e-3)
 
 
 def test_arrays_that_are_missing_cut_or_foreign_are_refused(trained, tmp_path, monkeypatch):
     method, folder, whole = trained
-    write_coded(whole, read_shared_head(folder), tmp_path, Precision(), None, folder / "driving.npz")
+    write_coded(
+        parts_of(whole, read_shared_head(folder), None),
+        read_shared_head(folder),
+        tmp_path,
+        Precision(),
+        folder / "driving.npz",
+    )
     content = read_content(tmp_path / COMPACT_FILE)
 
     def refused(arrays, text=content.text, steps=content.steps):
@@ -135,12 +149,12 @@ def test_a_coded_avatar_is_made_for_each_step(clip, tmp_path):
 def test_only_trained_avatars_are_coded(clip, tmp_path):
     store(clip, tmp_path)
     head = read_shared_head(tmp_path)
-    write_coded(Ours().load(tmp_path, device="cpu"), head, tmp_path, Precision(), None, None)
+    write_coded(parts_of(Ours().load(tmp_path, device="cpu"), head, None), head, tmp_path, Precision(), None)
     options = {"device": "cpu", "seed": 0, "progress": no_progress}
     other = NearestCamera().fit(clip, tmp_path / "nearest", Budget(iterations=1), **options)
     for avatar, found in ((Ours().load(tmp_path, device="cpu"), "a coded one"), (other, "Nearest")):
         with pytest.raises(InputError, match=f"found {found}|found a {found}"):
-            write_coded(avatar, head, tmp_path / "out", Precision(), None, None)
+            write_coded(parts_of(avatar, head, None), head, tmp_path / "out", Precision(), None)
     assert not (tmp_path / "out").exists()
 
 
@@ -150,7 +164,13 @@ def test_hidden_splats_are_rounded_more_coarsely(clip, tmp_path, monkeypatch):
     table = whole.field.tensors["splats"].numpy()
     weights = np.where(np.arange(len(table)) % 2, 1.0, 2.0**-8)
     monkeypatch.setattr("headbench.methods.avatars.compact.codecs.importance", lambda *_: weights)
-    write_coded(whole, read_shared_head(tmp_path), tmp_path / "coded", Precision(), clip, None)
+    write_coded(
+        parts_of(whole, read_shared_head(tmp_path), clip),
+        read_shared_head(tmp_path),
+        tmp_path / "coded",
+        Precision(),
+        None,
+    )
     found = Ours().load(tmp_path / "coded", device="cpu").field.tensors["splats"].numpy()
     visible = np.count_nonzero(weights == 1)
     for part, rows in ((weights == 1, found[:visible]), (weights < 1, found[visible:])):
