@@ -106,12 +106,9 @@ def test_an_exposure_adds_light_where_it_is_covered():
     np.testing.assert_allclose(rgb[0], [red, 0.5 * (red + blue)])
 
 
-@pytest.mark.parametrize(("speed", "several"), [(0.0, False), (0.9, True)])
-def test_a_moving_head_is_the_mean_of_its_sub_frames(plan, recorded, speed, several):
+def test_a_moving_head_is_the_mean_of_its_sub_frames(plan, recorded):
     def curves(time):
-        return {
-            name: speed * (time - 1.0) if name == "head_turn" else np.zeros(len(time)) for name in CONTROLS
-        }
+        return {name: 0.9 * (time - 1.0) if name == "head_turn" else np.zeros(len(time)) for name in CONTROLS}
 
     zero = dict.fromkeys(CONTROLS, 0.0)
     turning = Performed("FREE", [zero], {}, 1.0, np.ones(1), curves)
@@ -122,18 +119,16 @@ def test_a_moving_head_is_the_mean_of_its_sub_frames(plan, recorded, speed, seve
     )
     sharp, blurred = recorded(moving), recorded(moving, motion_blur=4.0)
     offsets = blurred.sub_frames("FREE", 0)
-    assert (len(offsets) > 1) is several
+    assert len(offsets) > 1
     assert offsets.sum() == pytest.approx(0.0)
     blurred.render_frames("FREE", 0, [FRONTAL])
     seed, masks = plan.render_seed("FREE", 0, FRONTAL), []
     for offset in offsets:
         sharp.pose_at("FREE", 0, offset)
-        picture, mask = sharp.render(FRONTAL, seed)
+        _, mask = sharp.render(FRONTAL, seed)
         masks.append(mask.astype(float))
-    written, found = blurred._plan.writer.written[FRONTAL]
+    _, found = blurred._plan.writer.written[FRONTAL]
     np.testing.assert_allclose(found, np.mean(masks, axis=0), atol=1.0)
-    if not several:
-        np.testing.assert_array_equal(written, picture)
 
 
 def disc(radius, size=120):

@@ -44,6 +44,7 @@ def test_the_change_reaches_the_rows(patterned_capture, tmp_path):
         "--out",
         str(tmp_path / "r"),
     ]
+    words += ["--set", "settings.ga.budget.iterations=2"]
     assert cli.main([*words, "--set", "metrics=psnr", "--set", f"conditions={conditions}"]) == 0
     rows = pd.read_parquet(tmp_path / "r" / "rows.parquet")
     means = rows[rows["metric"] == "psnr"].groupby("condition")["value"].mean()
