@@ -17,25 +17,25 @@ class Precision:
     step: float = 1.0
     """Factor of all steps: a coarser or finer codec with the same balance."""
 
-    positions: float = 0.07
+    positions: float = 0.08
     """Step of local positions, in the splat's own size (geometric mean of its three standard deviations)."""
 
-    scales: float = 0.04
-    """Step of log-scales: 0.04 is an error of at most 2 %."""
+    scales: float = 0.045
+    """Step of log-scales: 0.045 is an error of at most 2.3 %."""
 
-    rotations: float = 0.018
-    """Step of the components of quaternions: 0.018 is an error of about 0.6 degrees."""
+    rotations: float = 0.02
+    """Step of the components of quaternions: 0.02 is an error of about 0.7 degrees."""
 
-    opacities: float = 0.1
-    """Step of opacity logits: an opacity is off by 0.0125 at most."""
+    opacities: float = 0.12
+    """Step of opacity logits: an opacity is off by 0.015 at most."""
 
-    harmonics: float = 0.01
+    harmonics: float = 0.0115
     """Step of colours by spherical harmonics, in colour: root mean square over directions."""
 
-    colors: float = 0.01
+    colors: float = 0.0115
     """Step of the separate colours of splats, added to those of the planes."""
 
-    planes: float = 0.01
+    planes: float = 0.0115
     """Step of the colour contribution of the channels of a plane, in [0, 1], as weighted by the colour network."""
 
     lines: float = 0.012
