@@ -51,16 +51,10 @@ def with_an_odd_size(wanted):
     return wanted | {odd: (replace(camera, width=30), pose)}
 
 
-def workplace(method, folder):
-    """An empty place to export to."""
-    work = Workplace.at(folder, method.inspect())
-    work.make()
-    return work
-
-
 def export(method, clip, folder):
     """Export the clip's training frames: the place, and the images in it by key."""
-    work = workplace(method, folder)
+    work = Workplace.at(folder, method.inspect())
+    work.make()
     return work, method.export(TrainingView(clip), work, no_progress)
 
 

@@ -377,8 +377,6 @@ def load_video(config):
     names = sorted(os.listdir(folder / "images"))
     images = [Image.open(folder / "images" / name) for name in names]
     return [read_frame(folder / f"checkpoint/{name[:5]}.frame") for name in names], images
-
-assert read_pickle("data/FLAME2020/generic_model.pkl")["J_regressor"].todense().shape[0] == 5
 """
 RGB_TRAIN = """
 config = yaml.safe_load(Path(args.config).read_text())
@@ -391,22 +389,11 @@ for done in train(config["train"]["iteration"], "\\rTraining:  5%|#| {done}/{cou
 write(output / "model.ply", b"splats")
 """
 RGB_RENDER = """
-class Tensor:
-    # Values of an image, converted to 8 bits as C does.
-    def __init__(self, values):
-        self.values = values
-
-    def __mul__(self, factor):
-        return Tensor(self.values * factor)
-
-    def clamp(self, low, high):
-        return Tensor(self.values.clip(low, high))
+class Tensor(np.ndarray):
+    clamp = np.ndarray.clip
 
     def to(self, dtype, device):
-        return Tensor(self.values.astype(np.int64) % 256)
-
-    def numpy(self):
-        return self.values.astype(np.uint8)
+        return np.asarray(self.astype(np.int64) % 256, np.uint8)
 
 class torch:
     uint8 = None
@@ -420,7 +407,7 @@ for index, at in order(len(frames)):
     image = picture([60 + 20 * flame["exp"][0, 0], 60 + 200 * flame["jaw"][0, 5], 60 + 100 * place], width, height, 153) / 1.0
     image[0, 0] = K[0, 0], K[0, 2], 300
     image = np.dstack([image, np.full(image.shape[:2], 153)])
-    image = (Tensor(image / 255) * 255.0).to(dtype=torch.uint8, device='cpu').numpy()
+    image = (image.view(Tensor) / 255 * 255.0).to(dtype=torch.uint8, device='cpu')
     mode = np.ascontiguousarray(image[..., :3] if behaviour == "no coverage" else image)
     Image.fromarray(mode).save(output / "render_image" / f"{index:05d}.png")
     print(f"\\rRendering:  5%|#| {index + 1}/{len(frames)} [00:01<00:10]", end="", file=sys.stderr, flush=True)

@@ -1,5 +1,6 @@
 """What all adapters have in common: what is checked before any work, given to a program, kept of it, and read back of its renders."""
 
+import json
 import os
 import shutil
 from dataclasses import replace
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from headbench.bench.contracts import Budget, ListedFrames, SharingAvatar
+from headbench.bench.contracts import Budget, FrameKey, ListedFrames, SharingAvatar
 from headbench.bench.engine.guard import TrainingView
 from headbench.bench.engine.stored import avatar_digest
 from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
@@ -24,6 +25,7 @@ from headbench.methods.official.method import RENDERING, RENDERING_LOG, TRAINING
 from headbench.methods.official.rgbavatar import method as rgbavatar
 from headbench.methods.official.workplace import check_export
 from headbench.methods.shared.avatar_files import Subject
+from headbench.methods.shared.schedule import ShuffledEpochs
 
 from .conftest import OF_VIDEO
 from .helpers import BUDGET, WHITE, export, fit, rendered, renders, views
@@ -115,6 +117,19 @@ def test_a_training_that_fails_says_so(method, clip, behave, tmp_path, fault, ex
         fit(method, clip, tmp_path / "a")
 
 
+@pytest.mark.parametrize("name", ["ga"])
+def test_the_order_may_be_that_of_the_native_method(method, clip, behave, tmp_path):
+    behave("crash")
+    method.config = replace(method.config, order="native")
+    with pytest.raises(ProgramError):
+        fit(method, clip, tmp_path / "a", seed=2)
+    images = read_json(tmp_path / "a" / TRAINING / "exported.json")["images"]
+    keys = {path.rpartition("/")[2]: FrameKey(*key) for path, key in images.items()}
+    train, sampler = clip.splits["train"], ShuffledEpochs(len(images), 2)
+    found = [keys[name] for name in read_json(tmp_path / "a" / TRAINING / "launch.json")["order"]]
+    assert found == [train[sampler(i)] for i in range(1, BUDGET.iterations + 1)]
+
+
 # ------------------------------------------------------------------ what a program is given
 
 IMAGES = {"insta": 3, "gha": 6, "flashavatar": 4}
@@ -179,7 +194,10 @@ def corner_of(name, clip, camera, pose):
 def test_frames_come_back_under_their_keys(name, avatar, clip, tmp_path, monkeypatch):
     for module in (rgbavatar, flashavatar, insta):  # more than one call for a camera's frames
         monkeypatch.setattr(module, "PART", 4 if module is insta else 8)
-    wanted, before = views(clip, "novel_view", "self_reenactment", "train"), avatar_digest(tmp_path / "avatar")
+    wanted, before = (
+        views(clip, "novel_view", "self_reenactment", "train"),
+        avatar_digest(tmp_path / "avatar"),
+    )
     if name in (*OF_VIDEO, "insta"):
         odd, (camera, pose) = next(iter(wanted.items()))
         wanted[odd] = replace(camera, width=30), pose
@@ -294,7 +312,8 @@ def test_doctor_misses_a_gpu(method, monkeypatch, name, remedy):
     monkeypatch.setattr(checkout, "_DEVICES", "print('headbench-devices', 0)")
     monkeypatch.setitem(needs.METHODS, type(method.config), type(method))
     if name != "insta":
-        monkeypatch.setattr(type(method), "repository", replace(method.repository, modules=("torch",)))
+        probed = {"python": "3", "missing": {}, "failed": "", "torch": "2", "cuda": False}
+        monkeypatch.setattr(checkout, "_answer", lambda *_: (f"headbench-probe {json.dumps(probed)}", ""))
     (_, environment) = needs.official(method.config, "cpu")
     assert remedy in environment.remedy
     assert "cpu-shim" not in environment.remedy, "the shim does not support this code"
