@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 
@@ -43,12 +41,6 @@ def rendered(avatar, wanted, ground=WHITE):
     for key, (camera, _) in wanted.items():
         assert found[key].rgb.shape == (camera.height, camera.width, 3)
     return found
-
-
-def with_an_odd_size(wanted):
-    """The same list, whose first frame has another width than the others."""
-    odd, (camera, pose) = next(iter(wanted.items()))
-    return wanted | {odd: (replace(camera, width=30), pose)}
 
 
 def export(method, clip, folder):

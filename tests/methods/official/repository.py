@@ -129,15 +129,14 @@ self.face_center_lst = torch.zeros([T, {}, 3], requires_grad=False).cuda()
 """
 
 
-def lip_numbers(head) -> tuple[tuple[list[int], list[int]], tuple[int, int]]:
-    """Vertices on which the stand-in's teeth would hang, which no vertex of the head has, and its vertices and triangles with teeth."""
+def make_repository(folder: Path, head) -> str:
+    """GaussianAvatars' and TGA's.
+
+    The stand-in's teeth would hang on vertices that no vertex of the head has.
+    """
     count, first = len(lip_rings(head)[0]), len(head.template) + 5
-    rings = list(range(first, first + 2 * count, 2)), list(range(first + 1, first + 2 * count, 2))
-    return rings, (max(rings[1]) + 1 + 120, len(head.faces) + 168)
-
-
-def make_repository(folder: Path, rings: tuple[list[int], list[int]], sizes: tuple[int, int]) -> str:
-    """GaussianAvatars' and TGA's, with rings and sizes of `lip_numbers`."""
+    rings = [list(range(start, start + 2 * count, 2)) for start in (first, first + 1)]
+    sizes = max(rings[1]) + 1 + 120, len(head.faces) + 168
     texts = [
         f'self.v.register_buffer(\n    "lip_outside_ring_{name}",\n    torch.tensor([\n {", ".join(map(str, ring))}, \n    ])\n)\n'
         for name, ring in zip(("upper", "lower"), rings)
@@ -228,7 +227,7 @@ class MeshHeadTrainer:
 }
 
 
-def make_head_avatar_repository(folder: Path) -> str:
+def make_head_avatar_repository(folder: Path, head) -> str:
     """Gaussian Head Avatar's, with the file that is downloaded."""
     commit = made(folder, GHA_FILES)
     (folder / "assets").mkdir()
@@ -286,9 +285,9 @@ if behaviour != "no cameras":
 """
 
 
-def make_insta_repository(folder: Path, masks: str = "v 0 0 0 1 0 0\nf 1 1 1\n") -> str:
-    """INSTA's, built; ``masks`` is the mesh that tells FLAME's topology."""
-    texts = {f"mesh_masks/{name}.obj": masks for name in MASKS}
+def make_insta_repository(folder: Path, head) -> str:
+    """INSTA's, built; its meshes have another topology than FLAME's."""
+    texts = {f"mesh_masks/{name}.obj": "v 0 0 0 1 0 0\nf 1 1 1\n" for name in MASKS}
     texts |= {"configs/nerf/main.json": '{"max_steps": 33000, "learning_rate": 0.25}'}
     commit = made(folder, {".gitignore": "build\n", "src/recorder.cu": "", **texts})
     program = folder / "build" / "rta"
@@ -331,8 +330,8 @@ for index, at in order(count):
 """
 
 
-def make_blendshapes_repository(folder: Path, vertices: int) -> str:
-    """GaussianBlendshapes', with ``vertices`` of the eyelid bases, which tell FLAME's topology."""
+def make_blendshapes_repository(folder: Path, head) -> str:
+    """GaussianBlendshapes', whose eyelid bases have another topology than the head."""
     texts = {
         "train.py": GBS + GBS_TRAIN,
         "test.py": GBS + GBS_RENDER,
@@ -342,7 +341,7 @@ def make_blendshapes_repository(folder: Path, vertices: int) -> str:
         **{f"data/{name}_billboard_tri.obj": "v 0 0 0\n" for name in ("up", "down")},
         **{f"data/FLAME2020/{name}.txt": "3\n1\n2\n" for name in ("back_of_head", "neck_exclude_vertex")},
     }
-    return made(folder, texts, {f"FLAME/blendshapes/{side}_eyelid.npy": vertices for side in "lr"})
+    return made(folder, texts, {f"FLAME/blendshapes/{side}_eyelid.npy": 1 for side in "lr"})
 
 
 # ------------------------------------------------------------------ RGBAvatar
@@ -414,8 +413,8 @@ for index, at in order(len(frames)):
 """
 
 
-def make_rgbavatar_repository(folder: Path, vertices: int, triangles: int) -> str:
-    """RGBAvatar's, with the sizes of the head of its texture chart."""
+def make_rgbavatar_repository(folder: Path, head) -> str:
+    """RGBAvatar's, with the sizes of a head."""
     texts = {
         "train_offline.py": RGB + RGB_TRAIN,
         "render.py": RGB + RGB_RENDER,
@@ -424,8 +423,8 @@ def make_rgbavatar_repository(folder: Path, vertices: int, triangles: int) -> st
     texts |= {"dataset/flame_dataset.py": "", "submodules/flame/flame.py": ""}
     chart = folder / "data/FLAME2020/flame_uv.npz"
     chart.parent.mkdir(parents=True)
-    np.savez(chart, vt=np.zeros((3, 2)), ft=np.zeros((triangles, 3), np.uint32))
-    return made(folder, texts, {f"data/FLAME2020/{side}_eyelid.npy": vertices for side in "lr"})
+    np.savez(chart, vt=np.zeros((3, 2)), ft=np.zeros((len(head.faces), 3), np.uint32))
+    return made(folder, texts, {f"data/FLAME2020/{side}_eyelid.npy": len(head.template) for side in "lr"})
 
 
 # ------------------------------------------------------------------ FlashAvatar
@@ -498,8 +497,9 @@ for iteration, at in order(len(scene.cameras)):
 FLASH_PLAIN = ("landmark_embedding.npy", "mediapipe/mediapipe_landmark_embedding.npz", "flame_mica.py")
 
 
-def make_flashavatar_repository(folder: Path, vertices: int) -> str:
-    """FlashAvatar's, with ``vertices`` in its mesh."""
+def make_flashavatar_repository(folder: Path, head) -> str:
+    """FlashAvatar's, with the vertices of a head in its mesh."""
+    vertices = len(head.template)
     texts = {
         "train.py": FLASH + FLASH_TRAIN,
         "test.py": FLASH + FLASH_TEST,
@@ -539,19 +539,13 @@ def stand_in(method: type) -> type:
 
 
 ADAPTERS = {
-    "ga": (stand_in(GAOfficial), lambda folder, head: make_repository(folder, *lip_numbers(head))),
-    "tga": (stand_in(TGAOfficial), lambda folder, head: make_repository(folder, *lip_numbers(head))),
-    "gbs": (stand_in(GBSOfficial), lambda folder, head: make_blendshapes_repository(folder, 1)),
-    "gha": (stand_in(GHAOfficial), lambda folder, head: make_head_avatar_repository(folder)),
-    "insta": (INSTAOfficial, lambda folder, head: make_insta_repository(folder)),
-    "rgbavatar": (
-        stand_in(RGBAvatarOfficial),
-        lambda folder, head: make_rgbavatar_repository(folder, len(head.template), len(head.faces)),
-    ),
-    "flashavatar": (
-        stand_in(FlashAvatarOfficial),
-        lambda folder, head: make_flashavatar_repository(folder, len(head.template)),
-    ),
+    "ga": (stand_in(GAOfficial), make_repository),
+    "tga": (stand_in(TGAOfficial), make_repository),
+    "gbs": (stand_in(GBSOfficial), make_blendshapes_repository),
+    "gha": (stand_in(GHAOfficial), make_head_avatar_repository),
+    "insta": (INSTAOfficial, make_insta_repository),
+    "rgbavatar": (stand_in(RGBAvatarOfficial), make_rgbavatar_repository),
+    "flashavatar": (stand_in(FlashAvatarOfficial), make_flashavatar_repository),
 }
 """Methods by name, and what writes their repository for a head and returns its commit."""
 

@@ -24,7 +24,7 @@ from headbench.methods.shared.schedule import DensifySchedule, Timeline
 
 from ...datasets.head.toy import toy_head
 from ...datasets.tiny_capture import make_plan, rig, write_tiny_capture
-from .repository import lip_numbers, make_interpreter, make_repository
+from .repository import make_interpreter, make_repository
 
 OFFICIAL = "ga-official (cpu-shim)"
 
@@ -36,7 +36,7 @@ def folder(tmp_path, monkeypatch):
     head = toy_head(16, version="procedural2020")
     plan = make_plan(lengths=lengths, cameras=rig(24, 32, 12.3, 15.1)[:2], head=head)
     write_tiny_capture(tmp_path / "capture", plan)
-    make_repository(tmp_path / "repository", *lip_numbers(toy_head(16)))
+    make_repository(tmp_path / "repository", toy_head(16))
     make_interpreter(tmp_path / "python")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(runner, "write_reports", lambda out: [])  # nothing here reads them
