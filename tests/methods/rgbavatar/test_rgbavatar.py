@@ -374,25 +374,6 @@ def test_timed_steps_give_no_colours(clip, variant):
     torch.testing.assert_close(*found, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("settings", "says"),
-    [
-        ({"color_init_variant": "official", "color_weight": 0.0}, "color_weight"),
-        ({"color_weight": -1.0}, "color_weight must not be negative"),
-        ({"online": True, "batch": 151}, "batch must be at most 150"),
-        ({"samples": 0}, "samples"),
-        ({"inputs": ()}, "inputs"),
-        ({"inputs": ("smile",)}, "inputs"),
-        ({"batch": 0}, "batch"),
-        ({"initial_scale_mm": 0.0}, "initial_scale_mm"),
-        ({"position_lr_final": 0.0}, "position_lr_final"),
-    ],
-)
-def test_settings_out_of_range_are_refused(settings, says):
-    with pytest.raises(ValueError, match=says):
-        RGBAvatarConfig(**settings)
-
-
 def test_inputs_that_the_head_model_lacks_alone_are_refused(clip):
     without = replace(clip, head=replace(clip.head, eyelid_basis=None))
     with pytest.raises(InputError, match=r"inputs: expected .* of the head model, found eyelids"):
