@@ -14,9 +14,9 @@ from headbench.bench.io.images import read_png
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
 
+from ..head.skinning import skinned
 from ..head.toy import toy_head
 from .mesh_method import SPEC, VIDEO, write_mesh_avatar
-from .skinning import skinned
 
 HEAD = toy_head(24, eyelids=True, version="flame2020")
 RNG = np.random.default_rng(0)

@@ -20,8 +20,8 @@ from headbench.datasets.head.procedural.versions import version_shapes
 from headbench.datasets.head.subject import pose_in_head_frame
 
 from ..head.refit.heads import subdivided
+from ..head.skinning import skinned
 from ..head.toy import toy_head
-from .skinning import skinned
 
 procedural_head = functools.cache(model.procedural_head)
 FRAMES = 4
