@@ -104,8 +104,12 @@ def _header(path: Path, metadata: Mapping[str, str]) -> Header:
     header: Header = checked(values, Header, path, KEY)
     sizes = [size for entry in header.arrays.values() for size in (*entry.shape, entry.size)]
     numbers = sum(math.prod(entry.shape) for entry in header.arrays.values())
-    if min(sizes, default=0) < 0 or numbers > MOST_NUMBERS:
-        raise InputError(path, f"{KEY}, arrays", f"at most {MOST_NUMBERS} numbers", str(numbers))
+    if (
+        min(sizes, default=0) < 0
+        or numbers > MOST_NUMBERS
+        or not all(e.shape for e in header.arrays.values())
+    ):
+        raise InputError(path, f"{KEY}, arrays", f"shapes of at most {MOST_NUMBERS} numbers", str(numbers))
     return header
 
 
