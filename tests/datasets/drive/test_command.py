@@ -214,7 +214,7 @@ REFUSED = {
     "two numbers": (lambda: lines('{"jawOpen": [0.1, 0.9]}'), (), "jawOpen: expected one number"),
     "no blendshape": (lambda: csv("time\n0\n"), ("--form", "blendshapes"), "a column with ARKit's name"),
     "a shape twice": (lambda: csv("jawOpen,JawOpen\n0.5,0.1\n"), (), "one column for jawOpen, found two"),
-    "arrays as parameters": (arrays, ("--form", "flame_param"), "arrays"),
+    "arrays as parameters": (arrays, ("--form", "flame_param", "--signal-head", "avatar"), "arrays"),
     "a missing head": (lambda: "signal.npz", ("--signal-head", "typo.pkl"), "--signal-head"),
     "no map": (lambda: csv("jawOpen\n1\n"), ("--map", "none.yaml"), "none.yaml"),
     "an unknown head": (lambda: "signal.npz", ("--signal-head", "2021"), "2020, 2023"),
