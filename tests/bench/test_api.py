@@ -40,20 +40,10 @@ def test_train_and_evaluate_give_the_rows_of_a_run(method, finished, clip, tmp_p
 
 
 def test_an_avatar_in_memory_is_scored_alike(finished, clip):
-    folder = finished.cell(clip.subject, "ga", 0).avatar
-    stored, loaded = (
-        hb.evaluate(avatar, clip, metrics=["psnr"], frames_per_task=1)
-        for avatar in (folder, hb.load_avatar(folder))
-    )
+    folder, how = finished.cell(clip.subject, "ga", 0).avatar, {"metrics": "psnr", "frames_per_task": 1}
+    stored, loaded = (hb.evaluate(avatar, clip, **how) for avatar in (folder, hb.load_avatar(folder)))
     pd.testing.assert_frame_equal(stored, loaded)
-    one = hb.evaluate(
-        folder,
-        finished.root.parent / "data",
-        tasks="novel_view",
-        metrics="psnr",
-        regions="face",
-        frames_per_task=1,
-    )
+    one = hb.evaluate(folder, finished.root.parent / "data", tasks="novel_view", regions="face", **how)
     pd.testing.assert_frame_equal(one, stored[stored.task == "novel_view"])
 
 
@@ -69,13 +59,13 @@ def test_the_table_of_runs_has_the_means_of_their_rows(finished):
         assert table.loc["ga", (task, "psnr")] == pytest.approx(mean)
 
 
-def test_a_head_is_posed_by_calling_it(clip):
+def test_a_head_is_posed_by_calling_it(clip, tmp_path):
     pose = next(iter(clip.poses.values()))
+    moved = hb.HeadPose(**{**vars(pose), "translation": pose.translation + 1})
+    hb.save_head(tmp_path / "head.npz", clip.head)
     still = clip.head(pose, clip.shape, clip.static_offset)
-    moved = clip.head(
-        hb.HeadPose(**{**vars(pose), "translation": pose.translation + 1}), clip.shape, clip.static_offset
-    )
-    np.testing.assert_allclose(moved - still, 1, atol=1e-12)
+    again = hb.load_head(tmp_path / "head.npz")(moved, clip.shape, clip.static_offset)
+    np.testing.assert_allclose(again - still, 1, atol=1e-5)
 
 
 def test_what_scripts_get_wrong_is_refused(finished, clip, tmp_path):
@@ -97,8 +87,3 @@ def test_what_scripts_get_wrong_is_refused(finished, clip, tmp_path):
         with pytest.raises(hb.InputError, match=said):
             call()
     assert not [*tmp_path.iterdir()]
-
-
-def test_methods_and_version_are_listed():
-    assert {"ga", "ours"} <= hb.list_methods().keys()
-    assert hb.__version__.count(".") == 2

@@ -2,8 +2,6 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from headbench.bench.configuration import build, deciding_settings, merge, parse_assignments
 from headbench.bench.errors import InputError
@@ -67,15 +65,6 @@ def test_merge_lays_one_over_the_other_without_changing_either():
     base, over = {"a": {"x": 1, "y": 2}, "b": 3}, {"a": {"y": 5}, "c": 6}
     assert merge(base, over) == {"a": {"x": 1, "y": 5}, "b": 3, "c": 6}
     assert base == {"a": {"x": 1, "y": 2}, "b": 3}
-
-
-@given(
-    st.dictionaries(
-        st.sampled_from("abc"), st.integers() | st.dictionaries(st.sampled_from("xy"), st.integers())
-    )
-)
-def test_merging_with_itself_or_nothing_changes_nothing(values):
-    assert merge(values, values) == merge(values, {}) == merge({}, values) == values
 
 
 @dataclass(frozen=True)

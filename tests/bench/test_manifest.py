@@ -37,21 +37,16 @@ def test_the_published_manifest_is_written_as_it_was_read(published, tmp_path):
         assert (tmp_path / "again" / file).read_bytes() == (published.parent / file).read_bytes()
 
 
-def test_a_missing_protocol_is_named(published):
-    own = Manifest.read(published)
-    shutil.rmtree(published.parent / PROTOCOLS)
-    with pytest.raises(InputError, match="the protocol of novel_view.*no such file") as caught:
-        Manifest.read(published)
-    path = protocol_path(published.parent, own.protocols["novel_view"].hash)
-    assert caught.value.file == str(path)
-
-
-def test_the_protocols_of_another_run_are_refused(published):
+def test_protocols_that_are_missing_or_of_another_run_are_refused(published):
     own = Manifest.read(published).protocols
     first, second = (protocol_path(published.parent, each.hash) for each in own.values())
     second.replace(first)
     with pytest.raises(InputError, match="task, hash: expected novel_view, .*found self_reenactment"):
         Manifest.read(published)
+    first.unlink()
+    with pytest.raises(InputError, match="the protocol of novel_view.*no such file") as caught:
+        Manifest.read(published)
+    assert caught.value.file == str(first)
 
 
 def check_refused(manifest, file, change, key):
@@ -70,20 +65,15 @@ def check_refused(manifest, file, change, key):
         (lambda m: m.pop("configuration"), "configuration"),
         (lambda m: m.update(more=1), "more"),
         (lambda m: m.update(status="ended"), "status"),
-        (lambda m: m.update(machine=[]), "machine"),
         (lambda m: m["configuration"].update(seeds=[]), "configuration"),
-        (lambda m: m["configuration"].update(seeds="0"), "configuration.seeds"),
         (lambda m: m["methods"][0].update(trivial="no"), "methods[0].trivial"),
         (lambda m: m["methods"][0].update(name="../up"), "methods"),
         (lambda m: m["methods"].append(m["methods"][0]), "methods"),
         (lambda m: m["metrics"][0].update(digits=10**9), "metrics[0]"),
-        (lambda m: m["metrics"][0].update(label="\x1b[2J"), "metrics[0]"),
         (lambda m: m["machine"].update(processor="x" * 1000), "machine, processor"),
         (lambda m: m["metrics"][0].update(tables=["/etc/x"]), "metrics, tables"),
         (lambda m: m["clips"][0].pop("fingerprint"), "clips[0].fingerprint"),
         (lambda m: m["clips"][0].update(subject="a/b"), "clips"),
-        (lambda m: m.pop("protocols"), "protocols"),
-        (lambda m: m["protocols"].update(novel_view=None), "protocols.novel_view"),
         (lambda m: m["protocols"].update(novel_view="../x"), "protocols.novel_view"),
     ],
 )
@@ -95,7 +85,6 @@ def test_a_manifest_that_is_none_is_refused_by_its_key(published, change, key):
     ("change", "key"),
     [
         (lambda p: p.pop("hash"), "hash"),
-        (lambda p: p.update(more=1), "more"),
         (lambda p: p.update(id="\x1b[2J"), "id"),
         (lambda p: p.update(hash="other"), "task, hash"),
         (lambda p: p["keys"][0].pop(), "keys[0][3]"),
@@ -128,12 +117,10 @@ def test_a_spec_that_no_results_could_be_read_with_is_refused(spec, changes):
     [
         ({"fingerprint": 1}, "fingerprint"),
         ({"status": "ended"}, "status"),
-        ({"interruptions": []}, "interruptions"),
         ({"seconds": "long"}, "seconds"),
         ({"fingerprints": []}, "fingerprints"),
         ({"files": {"avatar/a.npz": 1}}, "files.avatar/a.npz"),
         ({"files": {"../../a.npz": "0"}}, "files"),
-        ({"files": {"/etc/passwd": "0"}}, "files"),
         ({"second": 1.5}, "second"),
     ],
 )

@@ -7,14 +7,13 @@ import pytest
 
 from headbench.bench import progress as module
 from headbench.bench.engine import run as runner
-from headbench.bench.progress import RunProgress, TimeLeft, duration, progress
+from headbench.bench.progress import RunProgress, TimeLeft, duration
 
 
 class Clock:
     """Seconds that pass when they are told to."""
 
-    def __init__(self):
-        self.now = 1000.0
+    now = 1000.0
 
     def __call__(self):
         return self.now
@@ -72,22 +71,6 @@ def test_time_left_follows_from_steps_alone(clock, waits, steps, left):
     assert found.seconds == (None if left is None else pytest.approx(left))
 
 
-def test_steps_that_start_over_are_timed_again(clock):
-    found = TimeLeft()
-    work(clock, lambda done, total, _: found.step(done, total), 20, 1.0)
-    found.step(1, 50)
-    assert found.seconds is None
-    work(clock, lambda done, total, _: found.step(done, 50), 9, 3.0, start=1)
-    assert found.seconds == 41 * 3.0
-
-
-def test_a_line_has_steps_time_left_and_note(clock, lines):
-    with progress("measuring") as report:
-        work(clock, report, 10, 4.0, note="psnr")
-    assert lines[0] == "measuring: 1 of 10 (psnr)"
-    assert lines[4] == "measuring: 5 of 10, 20 s left (psnr)"
-
-
 def cells(*names, stages=("training", "rendering")):
     return {f"{subject} {method}": dict.fromkeys(stages, method) for subject, method in names}
 
@@ -110,43 +93,6 @@ def test_a_run_has_a_bound_until_all_of_it_has_a_basis(clock, lines):
         "cell 4 of 4, s2 ours: rendering 5 of 10, 10 s left",
     ]
     assert lines[0] == "cell 1 of 4, s1 ga: training"
-
-
-def test_alike_stages_of_any_method_are_a_basis(clock, lines):
-    stages = {"measuring": ""}
-    run = progress_of({"s ga": stages, "s ours": stages}, lines)
-    with run.step("s ga", "measuring"):
-        clock.passes(60)
-    with run.step("s ours", "measuring"):
-        pass
-    assert lines[-1] == "cell 2 of 2, s ours: measuring, 1 min 00 s left"
-
-
-def test_what_an_earlier_start_did_counts_as_if_done_now(clock, lines):
-    run = progress_of(cells(("s1", "ga"), ("s2", "ga"), stages=("training",)), lines)
-    with run.step("s1 ga", "training") as report:
-        clock.passes(30)
-        work(clock, report, 100, 1.0, start=90)
-    with run.step("s2 ga", "training"):
-        pass
-    assert "2 min" in lines[-1]  # 30 s to prepare and a second for each of 100 steps
-
-
-def test_a_stage_that_fails_or_was_not_ahead_is_no_basis(clock, lines):
-    run = progress_of({**cells(("s1", "ga")), "s2 ga": {}, **cells(("s3", "ga"))}, lines)
-
-    def fail():
-        with run.step("s1 ga", "training"):
-            clock.passes(50)
-            raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        fail()
-    with run.step("s2 ga", "rendering") as report:
-        work(clock, report, 10, 1.0)
-    with run.step("s3 ga", "training"):
-        pass
-    assert lines[-1] == "cell 3 of 3, s3 ga: training"
 
 
 @pytest.mark.parametrize("subjects", [("subject1", "subject2")])

@@ -152,6 +152,8 @@ FITS: list[str] = []
 
 
 class ToyMethod:
+    avatar = ToyAvatar
+
     def __init__(self, config):
         self.config = config
 
@@ -166,12 +168,11 @@ class ToyMethod:
         return self.load(out, device=device)
 
     def load(self, path, *, device):
-        return ToyAvatar(path)
+        return self.avatar(path)
 
 
 class MirrorMethod(ToyMethod):
-    def load(self, path, *, device):
-        return MirrorAvatar(path)
+    avatar = MirrorAvatar
 
 
 LISTS: list[list[FrameKey]] = []
@@ -193,8 +194,7 @@ class ListingAvatar(MirrorAvatar):
 
 
 class ListingMethod(ToyMethod):
-    def load(self, path, *, device):
-        return ListingAvatar(path)
+    avatar = ListingAvatar
 
 
 class CheckingMethod(ToyMethod):

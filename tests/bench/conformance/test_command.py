@@ -4,16 +4,13 @@ import ast
 import json
 import subprocess
 import sys
-from importlib.metadata import EntryPoint
 
 import pytest
 
 import headbench
-from headbench.bench import cli, contracts, errors, registry, specs
+from headbench.bench import cli, contracts, errors, specs
 from headbench.bench.conformance import command
 from headbench.bench.engine import captures
-
-from ...world import capture
 
 PLUGINS = ("grey:SPEC", "outside_reader:SPEC", "mae:MAE") + tuple(
     f"outside_metric:{name}" for name in ("ERROR", "JUMP", "FILES", "HOURS")
@@ -36,50 +33,18 @@ def test_plugins_written_outside_import_the_root_alone(outside):
         assert {name for name in names if name.startswith("headbench")} <= {"headbench"}
 
 
-def test_a_command_written_outside_reads_a_run(outside, run, capsys, monkeypatch):
-    worst = EntryPoint("worst", "outside_command:WORST", "headbench.commands")
-    found = registry.entry_points
-    monkeypatch.setattr(
-        registry, "entry_points", lambda group: [worst] if group == worst.group else found(group=group)
-    )
-    assert cli.main(["worst", str(run), "--count", "2", "--json"]) == 0
-    frames = json.loads(capsys.readouterr().out)
-    values = headbench.RunData.read(run).rows.select(
-        method="toy", metric="psnr", task=frames[0]["task"], region="full", seeds=headbench.ALL
-    )["value"]
-    assert [f["value"] for f in frames[:2]] == sorted(values)[:2]
-    for words, error in (
-        ([str(run), "--metric", "files"], "expected one of psnr, found files"),
-        ([str(run), "--region", "nose"], "one that the run measured"),
-        ([str(outside)], "expected the folder of a run"),
-    ):
-        assert cli.main(["worst", *words]) == 2
-        assert error in capsys.readouterr().err
-
-
-def test_an_experiment_written_outside_runs_its_conditions(
-    outside, npz_capture, tmp_path, monkeypatch, capsys
-):
-    noise = EntryPoint("noise", "outside_experiment:COMMAND", "headbench.commands")
-    found = registry.entry_points
-    monkeypatch.setattr(
-        registry, "entry_points", lambda group: [noise] if group == noise.group else found(group=group)
-    )
+def test_an_experiment_written_outside_runs_its_conditions(outside, npz_capture, tmp_path, monkeypatch):
     monkeypatch.setattr("headbench.bench.api.reader_of", lambda data: "outside_reader:SPEC")
-    words = ["noise", "--data", str(npz_capture), "--out", str(tmp_path / "run"), "--methods", "mean-image"]
-    assert cli.main([*words, "--preset", "smoke", "--deviations", "40"]) == 0
-    assert "mean-image+noise-40" in capsys.readouterr().out
-    rows = headbench.RunData.read(tmp_path / "run").rows
+    noise = headbench.Named("outside_experiment:NOISE", {"deviation": 40})
+    conditions = [headbench.PLAIN, headbench.Condition("noise-40", clip=noise)]
+    how = {"methods": ["mean-image"], "preset": "smoke", "metrics": ["psnr"], "conditions": conditions}
+    run = headbench.run(npz_capture, tmp_path / "run", **how)
+    rows = headbench.RunData.read(run).rows
     how = {"metric": "psnr", "task": "self_reenactment", "region": "full", "seeds": headbench.ALL}
     plain, noisy = (
         rows.select(method=name, **how)["value"].mean() for name in ("mean-image", "mean-image+noise-40")
     )
     assert plain != noisy
-
-
-def test_a_method_written_outside_draws_the_tracked_mesh(outside, capsys):
-    words = ["doctor", "check", "outside_method:SPEC", "--data", str(capture().union)]
-    assert cli.main(words) == 0, capsys.readouterr().out
 
 
 @pytest.fixture
@@ -104,15 +69,13 @@ def test_what_a_plugin_raises_is_a_breach_with_its_line(outside, grey, capsys):
 
 
 def test_without_data_a_method_is_tried_on_a_synthetic_capture(monkeypatch):
-    made, get = [], command.get
-    monkeypatch.setattr(command, "get", lambda group, name: made.append((group, name)) or get(group, name))
+    made = []
     monkeypatch.setattr(command, "resolve", lambda reference: lambda **arguments: made.append(arguments))
     monkeypatch.setattr(captures, "open_clips", lambda config: [made.append(config.data)])
     monkeypatch.setattr(command, "_adapted", lambda *_: None)
     monkeypatch.setattr(command, "check_method", lambda *_, **__: [])
     command.check_plugin(command.CheckPluginSettings("mean-image"))
-    names, arguments, data = made[-3:]
-    assert names == ("datasets", "synthetic")
+    arguments, data = made[-2:]
     assert str(arguments["out"]) == data
     assert arguments["cameras"] * arguments["timesteps"] <= 12
 
@@ -123,12 +86,9 @@ def test_without_data_a_method_is_tried_on_a_synthetic_capture(monkeypatch):
         (["ga"], "--kind, one of methods, datasets"),
         (["ga", "--kind", "datasets"], "--data: expected a capture"),
         (["nothing"], "a name that `headbench list` shows"),
-        (["nothing", "--kind", "metrics"], "expected one of"),
         (["no_module:SPEC"], "PYTHONPATH"),
         (["outside_metric:hours"], "a MethodSpec, a DatasetSpec or a MetricSpec"),
-        (["psnr", "--set", "a=1"], "a metric has none"),
         (["synthetic", "--data", "."], "one that makes captures"),
-        (["outside_reader:SPEC", "--data", "nowhere"], "no such file or folder"),
         (["outside_reader:SPEC", "--data", ".", "--set", "drak=true"], "dark"),
     ],
 )

@@ -6,7 +6,6 @@ import pytest
 from headbench.bench.conformance.methods import check_method
 from headbench.bench.contracts import Frame
 from headbench.bench.engine.config import resolve_method
-from headbench.bench.errors import HeadbenchError
 
 
 @pytest.fixture
@@ -17,10 +16,6 @@ def check(toy, tmp_path):
         )
 
     return run
-
-
-def test_a_method_that_keeps_the_contract_passes(check):
-    assert check() == []
 
 
 COUNT = iter(range(100))
@@ -41,15 +36,6 @@ def test_a_bad_frame_is_found(toy, monkeypatch, check, change, breach):
     original = toy.ToyAvatar.render
     monkeypatch.setattr(toy.ToyAvatar, "render", lambda *arguments: change(original(*arguments)))
     assert any(breach in found for found in check())
-
-
-def test_looking_at_held_out_frames_raises(toy, monkeypatch, check):
-    def fit(self, clip, out, budget, **_):
-        clip.image(clip.splits["novel_view"][0])
-
-    monkeypatch.setattr(toy.ToyMethod, "fit", fit)
-    with pytest.raises(HeadbenchError, match="not a training frame"):
-        check()
 
 
 def test_a_file_outside_the_folder_is_found(toy, monkeypatch, check, tmp_path):

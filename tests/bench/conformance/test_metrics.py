@@ -121,12 +121,6 @@ def test_other_kinds_are_checked_by_their_own_protocols(metrics, monkeypatch, sp
     assert any(breach in one for one in found), found
 
 
-def test_a_detail_that_the_measurement_lacks_is_found(metrics):
-    assert check_metric(replace(metrics.HOURS, detail="days")) == [
-        "the measurement has no detail 'days', which the specification names"
-    ]
-
-
 def test_what_is_not_installed_is_no_breach(metrics, monkeypatch):
     def absent(image, truth):
         raise UnavailableError("The weights are not here.", "Fetch them.")

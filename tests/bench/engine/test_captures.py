@@ -33,27 +33,23 @@ def test_settings_reach_the_reader_with_their_types(config, toy, monkeypatch):
     given["progress"](1, 2, "a Progress")
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "expected"),
-    [
-        ("cy", "sideways", "one of bottom, centre, top or one of auto"),
-        ("teeth", True, "one of add, auto, keep"),
-        ("leaks", "ignore", "one of error, record"),
-        ("cache_mb", "abc", "a number"),
-        ("background", "red", "a number"),
-        ("head", [1], "a path"),
-        ("progress", 3, "one of"),
-        ("use_cache", True, "one of"),
-        ("path", "elsewhere", "one of"),
-        ("hed", "x", "head"),
-    ],
-)
-def test_a_setting_the_reader_cannot_take_is_named(config, key, value, expected):
+WRONG = {
+    "cy": "sideways",
+    "teeth": True,
+    "cache_mb": "abc",
+    "head": [1],
+    "progress": 3,
+    "path": "x",
+    "hed": "x",
+}
+
+
+@pytest.mark.parametrize("key", WRONG)
+def test_a_setting_the_reader_cannot_take_is_named(config, key):
     with pytest.raises(InputError) as caught:
-        open_clips(config("ga", **{key: value}))
+        open_clips(config("ga", **{key: WRONG[key]}))
     assert caught.value.file == "reader_settings"
     assert caught.value.key.startswith(key)
-    assert expected in caught.value.expected
 
 
 def test_an_error_inside_a_reader_is_no_wrong_setting(config, toy, monkeypatch):
@@ -71,30 +67,23 @@ def test_what_makes_captures_is_no_reader(config, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["subject1"]
 
 
-@pytest.mark.parametrize("part", ["subject", "sequence", "camera"])
-def test_names_that_lead_out_of_the_run_folder_are_refused(config, toy, monkeypatch, part):
+@pytest.mark.parametrize("part", ["subject", "sequence", "camera", "the same subject"])
+def test_names_that_lead_out_or_are_not_unique_are_refused(config, toy, tmp_path, monkeypatch, part):
     outside = "../outside"
+    (tmp_path / "subject2").mkdir()
 
     def read(path):
-        clip = toy.ToyClip(path)
+        clip = toy.ToyClip("same" if part == "the same subject" else path)
         if part == "subject":
             clip.subject = outside
         elif part == "sequence":
             clip.splits["train"] = tuple(key._replace(sequence=outside) for key in clip.splits["train"])
-        else:
+        elif part == "camera":
             clip.cameras[outside] = Camera(outside, 8, 6, np.eye(3), np.eye(4))
         return clip
 
     monkeypatch.setattr(toy, "read", read)
-    with pytest.raises(InputError) as caught:
-        open_clips(config())
-    assert caught.value.key == part
-
-
-def test_two_captures_of_one_subject_are_refused(config, toy, tmp_path, monkeypatch):
-    (tmp_path / "subject2").mkdir()
-    monkeypatch.setattr(toy, "read", lambda path: toy.ToyClip("same"))
-    with pytest.raises(InputError, match="same, same"):
+    with pytest.raises(InputError, match="same, same" if part == "the same subject" else f"{part}: "):
         open_clips(config())
 
 

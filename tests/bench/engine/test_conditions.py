@@ -25,12 +25,10 @@ def clip(name, /, **parameters):
         (clip("cameras"), "conditions, cameras, parameters.part: expected a value"),
         (clip("cameras", part=[1]), "part: expected text"),
         (clip("cameras", prt="1/2"), "Did you mean 'part'"),
-        (clip("cameras", config="x"), "config"),
         (clip("variant", name="x"), "expected a change of kind 'clip', found one of kind 'derive'"),
         (clip("camera", part="1/2"), "Did you mean 'cameras'"),
         (Condition("c", methods=("other",)), "methods of c"),
         (Condition("a/b"), "without slashes"),
-        (Condition("x" * 118), "of 1 to"),
         (Condition("c", settings={"levle": 1}), "Did you mean 'level'"),
     ],
 )
@@ -48,7 +46,6 @@ def test_a_condition_that_cannot_be_had_is_refused(config, toy, condition, match
         ({"conditions": [{}, {}]}, "each name once"),
         ({"conditions": [{"budget": "1/2"}]}, "a name for each"),
         ({"conditions": [{"name": "c", "budget": "2"}]}, "above 0 and at most 1"),
-        ({"conditions": [{"name": "c", "budget": "1/0"}]}, "above 0 and at most 1"),
         ({"conditions": [{"name": "c", "budget": "1e-999999999"}]}, "above 0 and at most 1"),
         ({"conditions": [{"name": "c", "derive": {"name": "variant"}}]}, "or a source that names"),
         (
@@ -79,12 +76,8 @@ def test_an_avatar_of_other_settings_is_no_source(config, toy):
     settings = {"toy": {"level": 0.9}}
     with pytest.raises(InputError, match="expected an avatar of the settings of this run"):
         runner.run(replace(driven, out=f"{config.out}-3", settings=settings))
-
-
-def test_a_method_named_again_has_the_settings_of_the_call(config):
-    runner.run(replace(config, settings={"toy": {"level": 0.1}}))
-    with pytest.raises(InputError, match="fingerprint"):
-        runner.run(config)
+    with pytest.raises(InputError, match="fingerprint"):  # nor is it one of another call
+        runner.run(replace(config, settings=settings))
 
 
 def test_labels_of_methods_and_conditions_do_not_collide(config, toy, monkeypatch):

@@ -9,7 +9,6 @@ from headbench.bench.condition import PLAIN, Condition, Named
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.run import planned_cells
 from headbench.bench.engine.store import RunFolder
-from headbench.bench.executors.settings import Execution
 from headbench.bench.rows import ALL
 
 DARK = Condition("dark", ("varying",), derive=Named("variant", {"name": "dark"}))
@@ -44,18 +43,6 @@ def test_derived_cells_follow_all_trainings(deriving, toy):
     assert qualities(rows, "varying+dark")["value"].tolist() == qualities(dark, "varying")["value"].tolist()
     codecs = {method.label: method.codec for method in RunFolder(Path(deriving.out)).read_manifest().methods}
     assert codecs == dict.fromkeys(("varying+dark", "varying", "toy"), "")
-
-
-def test_workers_derive_after_training(deriving, toy, tmp_path):
-    deriving = replace(deriving, methods=("toy_plugin:VARYING",))
-    inline = runner.run(deriving)
-    workers = runner.run(
-        replace(deriving, out=str(tmp_path / "workers")), Execution("processes", workers=1, threads=1)
-    )
-    assert (
-        qualities(inline, "varying+dark")["value"].tolist()
-        == qualities(workers, "varying+dark")["value"].tolist()
-    )
 
 
 def test_a_run_killed_before_it_derives_continues(deriving, toy, monkeypatch):

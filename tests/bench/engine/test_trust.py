@@ -72,30 +72,19 @@ def stored(tmp_path, monkeypatch):
     return stored
 
 
-OF_RUN, OF_COMMAND = ("program", "program, settings"), ("reader", "change of captures")
-
-
-@pytest.mark.parametrize("case", sorted(RUN.keys() - OF_RUN))
-def test_a_command_that_reads_a_run_applies_it(stored, tmp_path, case):
-    changes, key = RUN[case]
-    stored(**changes)
-    with pytest.raises(InputError, match=f"configuration.{key}: .*--trust"):
-        run_configuration(tmp_path, RunOptions())
-    assert run_configuration(tmp_path, RunOptions(trust=True)).data == str(tmp_path)
-
-
-@pytest.mark.parametrize("case", sorted(RUN.keys() - OF_COMMAND))
-def test_a_run_that_adds_to_a_folder_applies_it(stored, tmp_path, case):
+@pytest.mark.parametrize("case", sorted(RUN))
+def test_commands_that_read_or_continue_a_run_apply_it(stored, tmp_path, case):
     changes, key = RUN[case]
     config, folder = stored(**changes), RunFolder(tmp_path)
+    if "program" not in case:
+        with pytest.raises(InputError, match=f"configuration.{key}: .*--trust"):
+            run_configuration(tmp_path, RunOptions())
+        assert run_configuration(tmp_path, RunOptions(trust=True)).data == str(tmp_path)
+    if case in ("reader", "change of captures"):
+        return
     if case == "program, settings":  # of a method that this command names
         config = replace(config, methods=("ga", "ga-official"))
     with pytest.raises(InputError, match=f"configuration.{key}"):
         grown(config, folder)
     whole = grown(config, folder, trust=True)
     assert all(getattr(whole, name) == value for name, value in changes.items())
-
-
-def test_a_program_that_the_command_names_is_allowed(stored, tmp_path):
-    config = replace(stored(methods=("ga", "ga-official")), methods=("ga-official",))
-    assert set(grown(config, RunFolder(tmp_path)).methods) == {"ga", "ga-official"}

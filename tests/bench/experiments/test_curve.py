@@ -25,7 +25,6 @@ from headbench.reports.curve.points import MEASURED
 from headbench.reports.curve.settings import CurveReportSettings
 
 from ...datasets.flat_renderer import flat_pictures
-from ...world import capture as tiny_capture
 from ...world import run_on
 
 TESTS = Path(__file__).parents[2]
@@ -122,10 +121,10 @@ def test_less_to_train_on_is_measured_on_the_same_frames(make_run, plugin, over,
         ({(key.timestep, key.camera) for key in train}, budget.iterations) for train, budget in plugin.FITS
     ]
     assert trained == [(keys, 64) for keys in seen]
+    assert (run / f"curve-{over}" / "curve.png").is_file()
     measured = {(t, HELD_CAMERA) for t in (0, 1, 3)} | {(HELD_TIMESTEP, camera) for camera in "0134"}
     assert sorted(plugin.RENDERED) == sorted([*measured] * 3)
     assert [point[over] for point in findings.data["points"]] == [1, 2, 3]
-    assert (run / f"curve-{over}" / "curve.png").is_file()
 
 
 def test_pictures_are_counted_over_timesteps_and_cameras(make_run, plugin):
@@ -136,18 +135,13 @@ def test_pictures_are_counted_over_timesteps_and_cameras(make_run, plugin):
     assert trained[2] == {(1, "3")}  # the timestep and the camera in the middle
     assert {timestep for timestep, _ in trained[1]} == {0, 1, 3}
     assert {camera for _, camera in trained[1]} == set("034")
-    assert [point["pictures"] for point in findings.data["points"]] == [1, 4, 9]
-    assert [point["timesteps"] for point in findings.data["points"]] == [1, 3, 3]
-    assert (run / "curve-pictures" / "curve.png").is_file()
-
-
-def test_seconds_take_the_place_of_the_budget(make_run, plugin):
-    run = make_run("curve_plugin:METHOD")
+    points = [(point["pictures"], point["timesteps"]) for point in findings.data["points"]]
+    assert points == [(1, 1), (4, 3), (9, 3)]
+    plugin.FITS.clear()
     findings = curve_run(settings(run, over="seconds", seconds=(0.5, 2)))
     assert [budget for _, budget in plugin.FITS] == [Budget(None, 2.0), Budget(None, 0.5)]
-    assert [point["budget_seconds"] for point in findings.data["points"]] == [0.5, 2.0]
-    assert [point["fraction"] for point in findings.data["points"]] == [1.0, 1.0]
-    assert "0.5 s" in findings.text
+    points = [(point["budget_seconds"], point["fraction"]) for point in findings.data["points"]]
+    assert points == [(0.5, 1.0), (2.0, 1.0)]
 
 
 def test_tracking_error_changes_poses_alone(plugin, tmp_path):
@@ -167,11 +161,6 @@ def test_tracking_error_changes_poses_alone(plugin, tmp_path):
     made = tmp_path / "run" / "curve-tracking-error" / "capture-tracking-2"
     for picture in capture.rglob("*.png"):
         assert (made / picture.relative_to(capture)).samefile(picture)
-
-
-def test_the_tracking_of_recordings_stays(make_run):
-    with pytest.raises(InputError, match="expected a synthetic capture"):
-        curve_run(settings(make_run("curve_plugin:METHOD"), over="tracking_error"))
 
 
 def test_a_row_for_each_method_subject_and_part(make_run, plugin):
@@ -245,19 +234,13 @@ def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):
     ("changes", "match"),
     [
         ({"fractions": ("0",)}, "above 0 and at most 1"),
-        ({"fractions": ("3/2",)}, "above 0 and at most 1"),
-        ({"fractions": ("1/0",)}, "above 0 and at most 1"),
         ({"fractions": ("half",)}, "above 0 and at most 1"),
         ({"fractions": ("0.5", "1/2")}, "each once"),
-        ({"over": "tracking_error", "levels": (1.0, 1.0)}, "each once"),
         ({"over": "tracking_error", "levels": (4.5,)}, "from 0 to 4"),
-        ({"over": "tracking_error", "levels": (float("nan"),)}, "from 0 to 4"),
         ({"over": "seconds", "seconds": (0.0,)}, "above 0"),
-        ({"over": "pictures", "pictures": (4, 4)}, "each once"),
         ({"over": "seconds", "seconds": (1e6,)}, "below 1,000,000"),
         ({"over": "seconds", "seconds": (30.0, 30.0000001)}, "six digits"),
         ({"every": 1}, "at least 2"),
-        ({"frames": 0}, "at least 1"),
     ],
 )
 def test_settings_out_of_range_are_refused(changes, match):
@@ -272,40 +255,20 @@ def test_a_part_is_known_as_it_is_written_after_reduction(text):
     )
 
 
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        ({}, "budget of endless: expected iterations or seconds"),
-        ({"methods": ("notng",)}, "methods of the run: noting, endless"),
-        ({"methods": ("noting",), "camera": "2"}, "a training camera: 0, 1, 3, 4"),
-    ],
-)
-def test_what_cannot_be_trained_is_refused_before_work(make_run, plugin, changes, match):
+REFUSED = [
+    ({}, "budget of endless: expected iterations or seconds"),
+    ({"methods": ("notng",)}, "methods of the run: noting, endless"),
+    ({"methods": ("noting",), "camera": "2"}, "a training camera: 0, 1, 3, 4"),
+    ({"methods": ("noting",), "over": "tracking_error"}, "expected a synthetic capture"),
+]
+
+
+def test_what_cannot_be_trained_is_refused_before_work(make_run, plugin):
     run = make_run("curve_plugin:METHOD", "curve_plugin:ENDLESS")
-    with pytest.raises(InputError, match=match):
-        curve_run(settings(run, **changes))
+    for changes, match in REFUSED:
+        with pytest.raises(InputError, match=match):
+            curve_run(settings(run, **changes))
     assert plugin.FITS == []
-
-
-def test_points_that_are_there_are_kept(make_run, plugin):
-    run = make_run("curve_plugin:METHOD", "curve_plugin:TIMED")
-    whole = {"fractions": ("1", "1/4")}
-    curve_run(settings(run, **whole))
-    before = table(run)
-    for less in ({"methods": ("noting",)}, {"fractions": ("1",)}):
-        curve_run(settings(run, **{**whole, **less}))
-        assert table(run) == before
-    assert len(plugin.FITS) == 4
-    curve_run(settings(run, fractions=("1", "1/2", "1/4")))
-    assert len(table(run)) == 6
-    assert len(plugin.FITS) == 6
-
-
-def test_a_run_that_did_not_end_and_a_curve_are_no_runs(make_run, plugin):
-    run = make_run("curve_plugin:METHOD")
-    curve_run(settings(run, fractions=("1",)))
-    with pytest.raises(InputError, match="one of a curve"):
-        curve_run(settings(run / "curve"))
     folder = RunFolder(run)
     replace(folder.read_manifest(), status="started").write(folder.manifest)
     with pytest.raises(InputError, match="expected 'done'"):
@@ -313,20 +276,18 @@ def test_a_run_that_did_not_end_and_a_curve_are_no_runs(make_run, plugin):
     assert not (run.parent / "other").exists()
 
 
-def test_a_method_that_keeps_images_keeps_none_that_is_held_out(plugin, tmp_path):
-    run_on(tiny_capture().union, tmp_path / "run", "nearest-camera", frames_per_task=1)
-    findings = curve_run(CurveSettings(str(tmp_path / "run"), methods=("nearest-camera",)))
-    (point,) = findings.data["points"]  # every part of its budget of one iteration is one iteration
-    assert point["fraction"] == 1.0
-    assert 0 < point["psnr_camera"] < 60
-
-
-def test_a_metric_that_is_missing_says_why(make_run, monkeypatch):
-    monkeypatch.setattr(module, "METRICS", ("psnr", "toy_plugin:NOT_HERE"))
-    findings = curve_run(settings(make_run("curve_plugin:METHOD"), fractions=("1",)))
-    assert findings.passed
-    assert "Absent missing: The toy weights are not here." in findings.text
-    assert findings.data["points"][0]["not_here_camera"] is None
+def test_points_that_are_there_are_kept(make_run, plugin):
+    run = make_run("curve_plugin:METHOD", "curve_plugin:TIMED")
+    whole = {"fractions": ("1", "1/4")}
+    curve_run(settings(run, **whole))
+    before = table(run)
+    curve_run(settings(run, methods=("noting",), fractions=("1",)))
+    assert table(run) == before
+    assert len(plugin.FITS) == 4
+    curve_run(settings(run, fractions=("1", "1/2", "1/4")))
+    assert len(table(run)) == len(plugin.FITS) == 6
+    with pytest.raises(InputError, match="one of a curve"):
+        curve_run(settings(run / "curve"))
 
 
 def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path):
@@ -335,29 +296,31 @@ def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path):
     runs = {each: make_run(*methods, subjects=(each,), folder=tmp_path / each) for each in subjects}
     parts = []
     for subject, method in product(subjects, ("noting", "timed")):
-        out = tmp_path / f"{subject}-{method}"
-        curve_run(settings(runs[subject], out=str(out), fractions=("1",), methods=(method,)))
-        parts.append(str(out))
+        parts.append(str(tmp_path / f"{subject}-{method}"))
+        curve_run(settings(runs[subject], out=parts[-1], fractions=("1",), methods=(method,)))
     joined = curve_runs(CurveReportSettings(tuple(parts), str(tmp_path / "joined")))
-    costs = set(MEASURED)
     shown = [
-        [{k: v for k, v in p.items() if k not in costs} for p in found.data["points"]]
+        [{k: v for k, v in p.items() if k not in MEASURED} for p in found.data["points"]]
         for found in (joined, whole)
     ]
     assert shown[0] == shown[1]
+    assert {entry["metric"] for entry in joined.data["best"]} == {"psnr"}
     # The mean of a method on fewer subjects is not beside that of the others.
     fewer = curve_runs(CurveReportSettings(tuple(parts[:3]), str(tmp_path / "fewer")))
     assert len(fewer.data["points"]) == 3
     one = curve_runs(CurveReportSettings(tuple(parts[:2]), str(tmp_path / "one")))
     assert fewer.text.partition("Written:")[0] == one.text.partition("Written:")[0]
-    with pytest.raises(InputError, match="a subject that all methods were trained on"):
-        curve_runs(CurveReportSettings((parts[0], parts[3]), str(tmp_path / "none")))
-    assert {entry["metric"] for entry in joined.data["best"]} == {"psnr"}
-    assert (tmp_path / "joined" / "curve.png").is_file()
-    with pytest.raises(InputError, match="each training of noting on ball-a once"):
-        curve_runs(CurveReportSettings((parts[0], parts[0]), str(tmp_path / "twice")))
-    with pytest.raises(InputError, match="run curve --over seconds`, found trainings of --over budget"):
-        curve_runs(CurveReportSettings(tuple(parts), str(tmp_path / "other"), "seconds"))
+
+    def refused(said, *folders, over="budget"):
+        with pytest.raises(InputError, match=said):
+            curve_runs(CurveReportSettings(folders, str(tmp_path / "refused"), over))
+
+    refused("a subject that all methods were trained on", parts[0], parts[3])
+    refused("each training of noting on ball-a once", parts[0], parts[0])
+    refused("run curve --over seconds`, found trainings of --over budget", *parts, over="seconds")
+    other = str(tmp_path / "camera")
+    curve_run(settings(runs["ball-a"], out=other, fractions=("1",), camera="4", methods=("timed",)))
+    refused("the held-out frames of ball-a", parts[0], other)
     manifest = RunFolder(Path(parts[1])).read_manifest()
     seeds = replace(manifest.configuration, seeds=(1,))
     for changed, said in (
@@ -366,10 +329,5 @@ def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path):
         ({"methods": [replace(m, version="9") for m in manifest.methods]}, "version of timed: expected 9"),
     ):
         replace(manifest, **changed).write(RunFolder(Path(parts[1])).manifest)
-        with pytest.raises(InputError, match=said):
-            curve_runs(CurveReportSettings((parts[1], parts[3]), str(tmp_path / "changed")))
-    other = tmp_path / "camera"
-    curve_run(settings(runs["ball-a"], out=str(other), fractions=("1",), camera="4", methods=("timed",)))
-    with pytest.raises(InputError, match="the held-out frames of ball-a"):
-        curve_runs(CurveReportSettings((parts[0], str(other)), str(tmp_path / "frames")))
-    assert [name for name in ("twice", "other", "frames") if (tmp_path / name).exists()] == []
+        refused(said, parts[1], parts[3])
+    assert not (tmp_path / "refused" / "curve.csv").exists()

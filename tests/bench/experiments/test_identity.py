@@ -132,13 +132,14 @@ def test_the_parts_are_those_that_nothing_moves(globe):
     assert len(steady) > 500
 
 
-@pytest.mark.parametrize(
-    ("rotation", "neck"),
-    [([0, 0, 0], [0, 0, 0]), ([0.1, 0.4, -0.2], [0, 0, 0]), ([0, 0.2, 0], [0.3, 0.1, 0])],
-)
-def test_the_own_look_stays_near_whatever_pose_and_expression(globe, look, rotation, neck):
-    pose = posed("fair", rotation, 1.7, neck=neck, translation=[0.01, 0.0, -0.02])
-    assert value(look, globe, pose) < 2.0
+def test_the_own_look_stays_near_whatever_pose_and_expression(globe, look):
+    for rotation, neck in (
+        ([0, 0, 0], [0, 0, 0]),
+        ([0.1, 0.4, -0.2], [0, 0, 0]),
+        ([0, 0.2, 0], [0.3, 0.1, 0]),
+    ):
+        pose = posed("fair", rotation, 1.7, neck=neck, translation=[0.01, 0.0, -0.02])
+        assert value(look, globe, pose) < 2.0
 
 
 def test_another_persons_look_is_far_for_both_subjects(globe, look):
@@ -150,18 +151,6 @@ def test_another_persons_look_is_far_for_both_subjects(globe, look):
     assert value(others, globe, pose) > 10 > 3 * value(others, other, pose)
     assert of_recording(look, globe, globe.splits["self_reenactment"], 12) < 2.0
     assert of_recording(look, other, other.splits["self_reenactment"], 12) > 10.0
-
-
-def test_an_uncoloured_avatar_is_worse_the_further_it_goes(globe, look):
-    pose = posed("fair", [0, 0.1, 0])
-    frame = globe.shown(pose)
-    grey = frame.rgb.mean(axis=2, keepdims=True)
-    differences = [
-        identity(look, Frame(frame.rgb + share * (grey - frame.rgb), frame.alpha), globe.camera, pose).value
-        for share in (0.0, 0.5, 1.0)
-    ]
-    assert differences == sorted(differences)
-    assert differences[2] > differences[0] + 3
 
 
 def test_what_the_camera_does_not_see_has_no_colour(globe):

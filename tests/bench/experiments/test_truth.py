@@ -225,14 +225,11 @@ def test_overlap_and_colour_are_those_counted_by_hand(judge):
     )
 
 
-def test_a_frame_that_is_not_finite_has_no_values(judge, pair):
+def test_frames_are_brought_to_the_size_of_the_truth_if_finite(judge, pair):
     rgb = np.full((40, 40, 3), np.nan, np.float32)
     assert TruthPair.of(Frame(rgb, np.ones((40, 40), np.float32)), pair[0]) is None
     assert {check.value for check in judge.appearance(None)} == {None}
     assert judge.response(None, None).outcome == ("missing", "the frame is not finite")
-
-
-def test_larger_frames_are_compared_at_the_size_of_the_truth(pair):
     large = np.repeat(np.repeat(pair[0].rgb / 255.0, 2, axis=0), 2, axis=1)
     found = TruthPair.of(Frame(np.float32(large), np.ones((80, 80), np.float32)), pair[0])
     assert np.array_equal(found.picture, pair[0].rgb)

@@ -86,18 +86,6 @@ def test_rigs_all_around_behind_and_of_one_camera(rig, count, beyond, azimuths, 
     assert [v.extrapolated for v in views] == extrapolated
 
 
-def test_a_turned_world_turns_the_views_with_it():
-    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    turn *= np.sign(np.linalg.det(turn))
-    motion = np.eye(4)
-    motion[:3, :3] = turn.T
-    rig = [camera(a, e) for a, e in ((-50, 10), (0, 0), (45, -10))]
-    turned = [Camera("", c.width, c.height, c.K, c.world_to_camera @ motion) for c in rig]
-    for a, b in zip(turntable(rig, CENTER, 7, 30.0), turntable(turned, turn @ CENTER, 7, 30.0)):
-        assert np.allclose(turn @ a.camera.center, b.camera.center)
-        assert np.allclose(a.camera.world_to_camera @ motion, b.camera.world_to_camera)
-
-
 @given(
     st.lists(st.tuples(st.floats(-180, 180), st.floats(-60, 60)), min_size=1, max_size=20),
     st.integers(1, 20),
@@ -123,13 +111,10 @@ def test_no_cameras_or_one_in_the_head_are_refused(rig):
         turntable(rig, CENTER, 4, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("azimuths", "expected"),
-    [
+def test_the_common_target_is_where_the_cameras_look():
+    head = CENTER + [0.0, -0.1, -0.1]
+    for azimuths, expected in (
         ([-40, 0, 40], CENTER),  # where the axes meet
         ([0], CENTER - [0.0, 0.0, 0.1]),  # the point of the axis that is nearest to the head's centre
-    ],
-)
-def test_the_common_target_is_where_the_cameras_look(azimuths, expected):
-    head = CENTER + [0.0, -0.1, -0.1]
-    assert np.allclose(common_target([camera(a) for a in azimuths], head), expected, atol=1e-3)
+    ):
+        assert np.allclose(common_target([camera(a) for a in azimuths], head), expected, atol=1e-3)

@@ -74,35 +74,41 @@ def judged(run, baseline, capsys):
     return judged
 
 
-def test_a_run_worse_by_0_3_db_fails_with_metric_subject_size(stored, remeasured, judged):
+def test_a_run_worse_by_0_3_db_fails_with_metric_subject_size(stored, remeasured, judged, tmp_path):
     code, out = judged()
-    assert code == 0
-    assert "nothing got worse (6 pass)" in out
+    assert (code, "nothing got worse (6 pass)" in out) == (0, True)
     loss = psnr_of(stored[0]) - psnr_of(remeasured("subject2", "self_reenactment", worse_by(0.3)))
     assert 0.3 <= loss < 0.5  # by whole pixels of a tiny image
-    code, out = judged()
+    junit, markdown = tmp_path / "gate.xml", tmp_path / "gate.md"
+    code, out = judged("--junit", str(junit), "--markdown", str(markdown))
     assert code == 1
     assert "1 regressed, 5 pass" in out
     assert "psnr of toy, subject subject2, self_reenactment: regressed" in out
     assert f"{-loss:.3f} dB" in out
+    suites = {suite.get("name"): suite for suite in ElementTree.parse(junit).getroot()}
+    assert {name: (s.get("tests"), s.get("failures")) for name, s in suites.items()} == {
+        "self_reenactment": ("2", "1"),
+        "novel_view": ("2", "0"),
+        "avatar": ("2", "0"),
+    }
+    failed = suites["self_reenactment"].find("testcase/failure/..")
+    assert failed.get("name") == "psnr full subject subject2"
+    assert failed.get("classname") == "self_reenactment.toy"
+    text = markdown.read_text()
+    assert text.startswith("### Gate: regressed (1 regressed, 5 pass)")
+    assert "| regressed | self\\_reenactment | toy | subject2 | psnr (dB) |" in text
 
 
-def test_a_noise_level_change_passes(stored, remeasured, judged):
-    def change(image):
-        image[0, 0, 0] += 1  # one channel of one pixel by one level
-        return image
-
-    assert not remeasured("subject2", "self_reenactment", change).equals(stored[0])
-    code, out = judged()
-    assert code == 0
-    assert "6 pass" in out
-
-
-def test_an_improvement_passes_and_says_how_to_keep_it(remeasured, judged):
+def test_improvements_and_new_numbers_pass_and_can_be_kept(baseline, remeasured, judged):
+    record = read_json(baseline)
+    for group in ("values", "frames"):
+        record[group] = {k: v for k, v in record[group].items() if k != "avatar/toy/subject2/full/files"}
+    record["count"] = len(record["values"])
+    write_json(baseline, record)
     remeasured("subject1", "novel_view", lambda image: np.full_like(image, 50))
     code, out = judged()
     assert code == 0
-    assert "1 improved, 5 pass" in out
+    assert "1 improved, 1 new, 4 pass" in out
     assert "--update" in out
     assert judged("--update")[0] == 0
     assert "6 pass" in judged()[1]
@@ -224,25 +230,15 @@ def test_speed_is_judged_on_request_and_on_its_own_machine_alone(slower, judged,
     assert "Environment changed: processor: abacus to" in out
 
 
-@pytest.mark.parametrize(
-    ("change", "counted"),
-    [
-        (lambda rows: rows[rows["metric"] != "files"], "2 unjudged, 4 pass"),
-        (
-            lambda rows: rows.assign(status=["failed" if m == "files" else "ok" for m in rows["metric"]]),
-            "4 pass",
-        ),
-    ],
-)
-def test_missing_speed_is_code_3_on_request_alone(slower, stored, judged, change, counted):
+def test_missing_speed_is_code_3_on_request_alone(slower, stored, judged):
     rows, write = stored
-    write(change(rows))
-    code, out = judged()
-    assert code == 0
-    assert counted in out
-    code, out = judged("--judge-speed")
-    assert code == 3
-    assert "2 missing, 4 pass" in out
+    failed = rows.assign(status=["failed" if m == "files" else "ok" for m in rows["metric"]])
+    for changed, counted in ((rows[rows["metric"] != "files"], "2 unjudged, 4 pass"), (failed, "4 pass")):
+        write(changed)
+        code, out = judged()
+        assert (code, counted in out) == (0, True)
+        code, out = judged("--judge-speed")
+        assert (code, "2 missing, 4 pass" in out) == (3, True)
 
 
 def test_a_number_unavailable_in_the_baseline_too_is_no_loss(stored, judged, tmp_path):
@@ -266,36 +262,6 @@ def test_a_number_unavailable_in_the_baseline_too_is_no_loss(stored, judged, tmp
         code, out = judged(*options, baseline=path)
         assert code == expected
         assert words in out
-
-
-def test_a_new_number_passes(baseline, judged):
-    record = read_json(baseline)
-    for group in ("values", "frames"):
-        record[group] = {k: v for k, v in record[group].items() if "/subject1/" in k}
-    record["count"] = len(record["values"])
-    write_json(baseline, record)
-    code, out = judged()
-    assert code == 0
-    assert "3 new, 3 pass" in out
-
-
-def test_junit_and_markdown_say_the_same(run, baseline, remeasured, tmp_path):
-    remeasured("subject2", "self_reenactment", lambda image: image + 20)
-    junit, markdown = tmp_path / "gate.xml", tmp_path / "gate.md"
-    assert gate(run, baseline, "--junit", str(junit), "--markdown", str(markdown)) == 1
-    suites = {suite.get("name"): suite for suite in ElementTree.parse(junit).getroot()}
-    assert {name: (s.get("tests"), s.get("failures")) for name, s in suites.items()} == {
-        "self_reenactment": ("2", "1"),
-        "novel_view": ("2", "0"),
-        "avatar": ("2", "0"),
-    }
-    failed = suites["self_reenactment"].find("testcase/failure/..")
-    assert failed.get("name") == "psnr full subject subject2"
-    assert failed.get("classname") == "self_reenactment.toy"
-    text = markdown.read_text()
-    assert text.startswith("### Gate: regressed (1 regressed, 5 pass)")
-    assert "| regressed | self\\_reenactment | toy | subject2 | psnr (dB) |" in text
-    assert "<details><summary>5 passed</summary>" in text
 
 
 def test_invalid_results_are_code_3_and_the_reports_say_so(run, baseline, tmp_path, capsys):
@@ -332,12 +298,9 @@ def more(record, key, value=1.0):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (lambda r: r.update(format=9), "format"),
         (lambda r: r.pop("values"), "values"),
         (lambda r: r.update(values={}, count=0), "at least one number"),
-        (lambda r: r.update(values={}), "as many as count says, 6"),
         (lambda r: r["values"].popitem(), "as many as count says, 6"),
-        (lambda r: r.pop("count"), "count"),
         (lambda r: r.update(format=2), "format: expected 3"),
         (lambda r: r["frames"].popitem(), "a number from 1 for each of values"),
         (lambda r: r["frames"].update({"novel_view/toy/subject1/full/psnr": 0}), "a number from 1"),
@@ -348,9 +311,7 @@ def more(record, key, value=1.0):
         (lambda r: more(r, "a/b/c/d/psnr", math.nan), "a finite number"),
         (lambda r: more(r, "a/b/c/d/unheard"), "an entry 'unheard'"),
         (lambda r: r["tolerances"]["psnr"].update(absolute=-1.0), "a finite number from 0"),
-        (lambda r: r["tolerances"]["psnr"].update(absolut=1.0), "Did you mean 'absolute'"),
         (lambda r: r.update(captures="some"), "captures"),
-        (lambda r: r.update(protocols=[]), "protocols"),
     ],
 )
 def test_a_baseline_that_makes_no_sense_is_code_3_naming_what(run, baseline, change, match, capsys):
@@ -361,38 +322,9 @@ def test_a_baseline_that_makes_no_sense_is_code_3_naming_what(run, baseline, cha
     assert match in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "words", ["--update", "--junit x", "--baseline b --level 0.1", "--baseline b --captures same"]
-)
-def test_options_that_have_no_effect_are_refused(run, capsys, words):
-    assert cli.main(["compare", str(run), *words.split()]) == 2
-    assert "it has no effect" in capsys.readouterr().err
-
-
-def test_a_baseline_is_compared_with_one_run(run, baseline, capsys):
-    assert cli.main(["compare", str(run), str(run), "--baseline", str(baseline)]) == 2
-    assert "one folder with --baseline, found 2" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("option", ["--junit", "--markdown", "--baseline"])
-def test_the_folder_of_a_file_to_write_must_exist(run, baseline, tmp_path, option, capsys):
-    path = str(tmp_path / "none" / "below" / "file")
-    options = (path, "--update") if option == "--baseline" else (baseline, option, path)
-    assert gate(run, *options) == 2
-    assert f"{path}, {option}" in capsys.readouterr().err
-    assert not (tmp_path / "none").exists()
-
-
 def test_update_keeps_tolerances_that_were_set_by_hand(run, baseline):
     record = read_json(baseline)
-    assert record["tolerances"]["psnr"] == {
-        "higher_is_better": True,
-        "absolute": 0.1,
-        "relative": 0.0,
-        "machine_bound": False,
-        "unit": "dB",
-        "digits": 2,
-    }
+    assert record["tolerances"]["psnr"]["absolute"] == 0.1
     record["tolerances"]["psnr"]["absolute"] = 0.02
     write_json(baseline, record)
     assert gate(run, baseline, "--update") == 0

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
-from headbench.bench.io.documents import checked, parse_json, parse_setting, read_json, read_yaml
+from headbench.bench.io.documents import checked, parse_setting, read_json, read_yaml
 from headbench.bench.io.files import write_json
 
 TEXT = st.text(st.characters(max_codepoint=0xFFFF, exclude_categories=("Cs", "Cc")))
@@ -157,24 +157,6 @@ def test_a_wrong_entry_is_named_by_its_dotted_key(value, key):
     assert key is None or caught.value.key == key
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 1000
-
-
-@pytest.mark.parametrize(
-    ("value", "near"),
-    [
-        ({"count": 1, "part": {}}, "parts"),
-        ({"count": 1, "parts": {"x": {"share": 1, "side": []}}}, "sides"),
-        ({"count": 1, "optional": {"share": 1, "side": []}}, "sides"),
-    ],
-)
-def test_an_unknown_entry_is_answered_with_the_nearest(value, near):
-    with pytest.raises(InputError, match=f"Did you mean '{near}'"):
-        checked(value, Document, "a.json")
-
-
-def test_json_inside_another_file_is_named_with_it():
-    with pytest.raises(InputError, match="a.npz, settings: expected valid JSON"):
-        parse_json("{", "a.npz", "settings")
 
 
 @pytest.mark.parametrize("read", [read_json, read_yaml])

@@ -1,9 +1,11 @@
 import errno
 import os
+import re
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError, UnavailableError, is_damage
@@ -17,12 +19,10 @@ from headbench.bench.io.files import (
     check_writable,
     digest,
     digest_file,
-    entries,
     expand_home,
     output_inside,
     reading,
     refuse_links,
-    write_json,
     write_text,
 )
 
@@ -69,11 +69,6 @@ def test_file_digest_is_sha256(tmp_path):
     assert digest_file(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
-def test_json_takes_numpy(tmp_path):
-    write_json(tmp_path / "a.json", {"x": np.float32(0.5), "y": np.arange(2), "p": tmp_path, "s": {"b", "a"}})
-    assert '"x": 0.5' in (tmp_path / "a.json").read_text()
-
-
 UNFIT = (
     "",
     ".",
@@ -98,18 +93,16 @@ def test_a_name_that_could_leave_its_folder_is_refused(name):
 
 
 @given(st.text(min_size=1, max_size=200))
-def test_an_accepted_name_stays_directly_in_its_folder(tmp_path_factory, name):
+@example("EMO-1-shout+laugh")
+@example("Kopf 3 (neu)")
+@example("a..b")
+def test_an_accepted_name_stays_directly_in_its_folder(name):
     try:
-        check_name(name, "capture.json", "subject")
+        assert check_name(name, "capture.json", "subject") == name
     except InputError:
+        assert not re.fullmatch(r"\w[\w ()+.-]{0,99}", name, re.ASCII)
         return
-    folder = tmp_path_factory.getbasetemp()
-    assert os.path.dirname(os.path.normpath(folder / name)) == str(folder)
-
-
-@pytest.mark.parametrize("name", ["074", "EMO-1-shout+laugh", "222200037", "Kopf 3 (neu)", "面", "a..b"])
-def test_names_of_the_field_are_accepted(name):
-    assert check_name(name, "", "") == name
+    assert os.path.dirname(os.path.normpath(f"/folder/{name}")) == "/folder"
 
 
 def test_an_error_of_the_system_names_the_file_meant(tmp_path):
@@ -140,13 +133,6 @@ def test_a_file_is_flushed_before_its_rename(tmp_path, monkeypatch):
     assert {path.name: path.read_text() for path in path.parent.iterdir()} == {"a": "old"}
 
 
-def test_two_writers_of_a_file_leave_one_whole_content(tmp_path):
-    with atomic_path(tmp_path / "a") as one, atomic_path(tmp_path / "a") as other:
-        one.write_text("one")
-        other.write_text("other")
-    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a", "one")]
-
-
 @pytest.mark.parametrize("target", ["a", "victim", "nothing"])
 def test_a_link_is_replaced_and_its_target_left_alone(tmp_path, target):
     (tmp_path / "victim").write_text("victim")
@@ -156,14 +142,6 @@ def test_a_link_is_replaced_and_its_target_left_alone(tmp_path, target):
     assert not (tmp_path / "a").is_symlink()
     assert (tmp_path / "a").read_text() == "ours"
     assert not (tmp_path / "nothing").exists()
-
-
-def test_a_file_that_lies_elsewhere_too_keeps_its_mode(tmp_path):
-    (tmp_path / "original").touch(0o400)
-    with atomic_path(tmp_path / "a") as temporary:
-        temporary.unlink()
-        os.link(tmp_path / "original", temporary)
-    assert (tmp_path / "original").stat().st_mode & 0o777 == 0o400
 
 
 @pytest.mark.parametrize("depth", ["link/a.txt", "link/new/folder/a.txt", "below/link/a.txt"])
@@ -188,22 +166,14 @@ def test_an_output_folder_may_itself_be_a_link(tmp_path):
     assert (tmp_path / "disk" / "b" / "a").exists()
 
 
-@pytest.mark.parametrize(("target", "refused"), [("../outside", True), ("a", False), ("none", False)])
-def test_links_that_lead_out_are_refused_for_writers_of_others(tmp_path, target, refused):
-    folder = tmp_path / "avatar"
-    folder.mkdir()
-    (folder / "link").symlink_to(target)
-    if refused:
-        with pytest.raises(InputError, match="a link out of it"):
-            refuse_links(folder)
-    else:
-        refuse_links(folder)
-
-
-def test_a_device_is_not_replaced(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(FileExistsError, match="Not a regular file"):
-        write_text(tmp_path / "pipe", "")
+def test_links_that_lead_out_are_refused_for_writers_of_others(tmp_path):
+    link = tmp_path / "avatar" / "link"
+    link.parent.mkdir()
+    for target in ("a", "none", "../outside"):
+        link.unlink(missing_ok=True)
+        link.symlink_to(target)
+        with pytest.raises(InputError, match="a link out of it") if ".." in target else nullcontext():
+            refuse_links(link.parent)
 
 
 @pytest.mark.parametrize(("kind", "mark"), [(kind, mark) for kind in KINDS for mark in KINDS[kind]])
@@ -219,51 +189,26 @@ def test_a_folder_of_another_kind_is_refused(tmp_path, kind, mark):
         assert caught.value.found == f"{kind} ({place.relative_to(tmp_path)})"
 
 
-@pytest.mark.parametrize(
-    "name", ["run.json", "rows.parquet", "transforms_test.json", "cameras.bin", "link.md"]
-)
-def test_results_are_not_written_over_by_a_named_file(tmp_path, name):
+def test_results_are_not_written_over_by_a_named_file(tmp_path):
     (tmp_path / "target.md").write_text("notes")
-    if name == "link.md":
-        (tmp_path / name).symlink_to(tmp_path / "target.md")
-    else:
-        check_writable(tmp_path / name, "--out")  # nothing is there yet
-        (tmp_path / name).write_text("{}")
-    with pytest.raises(InputError, match="--out: expected a file that is new"):
-        check_writable(tmp_path / name, "--out")
+    (tmp_path / "link.md").symlink_to(tmp_path / "target.md")
+    for name in ("run.json", "rows.parquet", "transforms_test.json", "cameras.bin", "link.md"):
+        if name != "link.md":
+            check_writable(tmp_path / name, "--out")  # nothing is there yet
+            (tmp_path / name).write_text("{}")
+        with pytest.raises(InputError, match="--out: expected a file that is new"):
+            check_writable(tmp_path / name, "--out")
     check_writable(tmp_path / "target.md", "--out")  # a table of an earlier time
 
 
-def test_files_of_operating_systems_are_no_entries(tmp_path):
-    names = ("._a.npz", ".DS_Store", "Thumbs.db", "desktop.ini", "__MACOSX", "b.npz", "a.npz")
-    for name in names:
-        (tmp_path / name).touch()
-    assert [path.name for path in entries(tmp_path)] == ["a.npz", "b.npz"]
-    assert [path.name for path in entries(tmp_path, "a*")] == ["a.npz"]
-    assert entries(tmp_path / "none") == []
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("~/a b", "/h/a b"),
-        ("~", "/h"),
-        ("a/~/b", "a/~/b"),
-        ("~ours", "~ours"),
-        ("./~/a", "./~/a"),
-        ("", ""),
-        ("~nobody-of-that-name/a", None),
-    ],
-)
-def test_a_tilde_is_the_home_folder(monkeypatch, text, expected):
+def test_a_tilde_is_the_home_folder(monkeypatch):
     monkeypatch.setenv("HOME", "/h")
-    if expected is None:
-        with pytest.raises(
-            InputError, match="run.yaml, ~nobody-of-that-name/a: expected a path in a home folder"
-        ):
-            expand_home(text, "run.yaml")
-    else:
+    for text, expected in {"~/a b": "/h/a b", "~": "/h", "a/~/b": "a/~/b", "~ours": "~ours", "": ""}.items():
         assert expand_home(text, "run.yaml") == expected
+    with pytest.raises(
+        InputError, match="run.yaml, ~nobody-of-that-name/a: expected a path in a home folder"
+    ):
+        expand_home("~nobody-of-that-name/a", "run.yaml")
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image, PngImagePlugin
+from PIL import Image
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import (
     ImageInfo,
-    encode_image,
     probe_image,
     quantise,
     read_bgr,
@@ -93,13 +92,13 @@ def test_rounding_goes_to_the_nearest_level_and_clamps():
     assert quantise(rgb).tolist() == [[[0, 0, 1], [254, 255, 255]]]
 
 
-@pytest.mark.parametrize(
-    ("rgb", "match"),
-    [([[[np.nan, np.inf, 0.0]]], "2 of 3"), (np.zeros((1, 1, 3), np.uint8), "floating-point")],
-)
-def test_what_is_no_colour_is_refused(rgb, match):
-    with pytest.raises(InputError, match=match):
-        quantise(np.asarray(rgb))
+def test_what_is_no_colour_is_refused():
+    for rgb, match in (
+        ([[[np.nan, np.inf, 0.0]]], "2 of 3"),
+        (np.zeros((1, 1, 3), np.uint8), "floating-point"),
+    ):
+        with pytest.raises(InputError, match=match):
+            quantise(np.asarray(rgb))
 
 
 STORED = {
@@ -149,27 +148,13 @@ MASKS = {
 }
 
 
-def test_a_comment_is_not_taken_for_the_transparent_level(tmp_path):
-    comment = PngImagePlugin.PngInfo()
-    comment.add_text("Comment", "a tRNS chunk follows")
-    path = tmp_path / "image.png"
-    picture("L").save(path, transparency=7, pnginfo=comment)
-    level = np.array(picture("L"))
-    assert np.array_equal(read_pixels(path)[..., 3], np.where(level == 7, 0, 255))
-
-
-@pytest.mark.parametrize("mode", ["L", "RGB"])
-def test_an_opaque_alpha_channel_of_an_image_covers_it(tmp_path, mode):
-    """Its own, where no mask is named: brightness is no coverage."""
-    (tmp_path / "image.png").write_bytes(saved(picture(mode).convert("RGBA")))
-    assert (read_mask(tmp_path / "image.png", own=True) == 255).all()
-
-
 @pytest.mark.parametrize("name", MASKS)
 def test_a_mask_covers_what_a_viewer_shows_as_not_black(tmp_path, name):
     content, expected = MASKS[name]
     (tmp_path / "mask.png").write_bytes(content)
     assert np.array_equal(read_mask(tmp_path / "mask.png"), expected)
+    if "opaque" in name:  # its own, where no mask is named: brightness is no coverage
+        assert (read_mask(tmp_path / "mask.png", own=True) == 255).all()
 
 
 @pytest.mark.parametrize("orientation", [3, 6, 7])
@@ -186,39 +171,6 @@ def test_pixels_stay_where_they_are_stored(tmp_path, mode, format, orientation):
     assert probe_image(paths[1]) == probe_image(paths[0])
 
 
-BEHIND = {
-    "text": b"trailing text",
-    "zeros": bytes(5000),
-    "markers of scans": b"\xff\xda\xff\xd8" * 1000,
-    "another image": STORED["RGB"] + saved(picture("L"), "JPEG") + bytes(100),
-}
-
-
-@pytest.mark.parametrize("behind", BEHIND)
-@pytest.mark.parametrize(
-    ("format", "options"),
-    [("PNG", {}), ("JPEG", {}), ("JPEG", {"progressive": True, "exif": b"Exif\0\0\xff\xd9"})],
-)
-def test_bytes_behind_an_image_are_ignored(tmp_path, format, options, behind):
-    whole = saved(picture("RGB"), format, **options)
-    plain, longer, cut = (tmp_path / name for name in ("plain", "longer", "cut"))
-    plain.write_bytes(whole)
-    longer.write_bytes(whole + BEHIND[behind])
-    assert np.array_equal(read_pixels(longer), read_pixels(plain))
-    assert probe_image(longer, decode=True) == probe_image(plain)
-    if behind in ("text", "zeros"):
-        cut.write_bytes(whole[: len(whole) // 2] + BEHIND[behind])
-        with pytest.raises(InputError, match="truncated"):
-            probe_image(cut)
-
-
-def test_a_file_of_two_pictures_is_read_as_its_first(tmp_path):
-    first, second = picture("RGB"), Image.new("RGB", (37, 23), "red")
-    (tmp_path / "first").write_bytes(saved(first, "JPEG"))
-    (tmp_path / "both").write_bytes(saved(first, "MPO", save_all=True, append_images=[second]))
-    assert np.array_equal(read_png(tmp_path / "both"), read_png(tmp_path / "first"))
-
-
 OTHERS = {
     "CMYK": (saved(picture("RGB").convert("CMYK"), "JPEG"), "4 components, CMYK or YCCK"),
     "16 bits": (saved(Image.fromarray(NOISE[..., 0].astype(np.uint16) * 257)), "bit depth 16"),
@@ -227,9 +179,6 @@ OTHERS = {
         "an animated PNG",
     ),
     "WebP": (saved(picture("RGBA"), "WEBP"), "WEBP data"),
-    "TIFF": (saved(picture("RGB"), "TIFF"), "TIFF data"),
-    "GIF": (saved(picture("P16"), "GIF"), "GIF data"),
-    "BMP": (saved(picture("RGB"), "BMP"), "BMP data"),
     "HEIC": (b"\0\0\0\x18ftypheic" + bytes(40), "HEIF, AVIF or video data"),
     "a file of macOS": (b"\0\x05\x16\x07" + bytes(80), "AppleDouble"),
     "a pointer": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "Git LFS pointer"),
@@ -253,31 +202,14 @@ def test_what_is_not_converted_is_refused_by_name(tmp_path, name):
         assert caught.value.file == str(path)
 
 
-WRITERS = {
-    "frame": ("a.png", lambda path: write_png(path, NOISE[..., :3])),
-    "image": ("a.png", lambda path: write_image(path, NOISE)),
-    "JPEG": ("a.jpg", lambda path: write_image(path, NOISE[..., :3])),
-}
-
-
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", ["a.png", "a.jpg"])
 def test_a_full_disk_is_reported_with_the_file(tmp_path, name):
-    file, write = WRITERS[name]
+    write = write_png if name == "a.png" else write_image
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (700, limits[1]))
     try:
-        with pytest.raises(OSError, match=rf"File too large: '{tmp_path / file}'$"):
-            write(tmp_path / file)
+        with pytest.raises(OSError, match=rf"File too large: '{tmp_path / name}'$"):
+            write(tmp_path / name, NOISE[..., :3])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert list(tmp_path.iterdir()) == []
-    write(tmp_path / file)
-    assert [path.name for path in tmp_path.iterdir()] == [file]
-
-
-@pytest.mark.parametrize(
-    ("shape", "suffix"), [((4, 4, 5), ".png"), ((0, 4, 3), ".png"), ((4, 4, 3), ".nope")]
-)
-def test_what_a_format_cannot_hold_is_refused(shape, suffix):
-    with pytest.raises(InputError, match=f"a.x: expected an image that the format {suffix} can hold"):
-        encode_image(np.zeros(shape, np.uint8), suffix, place="a.x")

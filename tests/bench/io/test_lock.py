@@ -80,12 +80,6 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path):
         assert not left.exists()
 
 
-def test_a_lock_beside_leaves_the_folder_empty(tmp_path):
-    with locked(tmp_path / "new", beside=True):
-        assert [path.name for path in tmp_path.iterdir()] == [".new.lock"]
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("beside", [False, True])
 @pytest.mark.parametrize("there", [False, True])
 def test_new_folders_in_which_nothing_was_written_are_removed(tmp_path, there, beside):

@@ -1,21 +1,19 @@
 """Marks of provenance, read by other libraries; pixels stay as they are, and frames that are measured have none."""
 
-import io
+from contextlib import nullcontext
 from importlib.metadata import version
 from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png, write_png
-from headbench.bench.io.provenance import COMPOSITE, RENDER, SYNTHETIC, mark_png, note
+from headbench.bench.io.provenance import COMPOSITE, RENDER, SYNTHETIC, note
 from headbench.bench.io.video import write_browser_video
 from headbench.methods.avatars.formats import STANDARD
 from headbench.methods.shared.ply import read_ply, write_ply
-from headbench.reports.drawing import SheetSection, Tile, TileRow, write_sheet
 
 TERMS = "http://cv.iptc.org/newscodes/digitalsourcetype/"
 
@@ -51,35 +49,15 @@ def test_marks_stand_beside_unchanged_pixels(tmp_path, pixels, kind):
     assert marked[:33] + marked[-len(plain) + 33 :] == plain
 
 
-def test_a_png_of_another_library_is_marked_too(tmp_path, pixels):
-    written = io.BytesIO()
-    Image.fromarray(pixels).convert("P").save(written, "png")
-    (tmp_path / "a.png").write_bytes(mark_png(written.getvalue(), RENDER))
-    assert source_of(tmp_path / "a.png")[1] == TERMS + RENDER
-    assert cv2.imread(str(tmp_path / "a.png")) is not None
-
-
-def test_sheets_are_composites(tmp_path, pixels):
-    section = SheetSection("a", ["b"], [TileRow(("c",), [Tile(pixels)])])
-    write_sheet(tmp_path / "sheet.png", [section], title="t", subtitle="s")
-    assert source_of(tmp_path / "sheet.png")[1] == TERMS + COMPOSITE
-
-
 @pytest.mark.parametrize("name", ["a.webm", "a.mp4"])
 def test_videos_carry_a_tag(tmp_path, name):
     av = pytest.importorskip("av")
-    frames = np.zeros((3, 16, 16, 3), np.uint8)
-    write_browser_video(tmp_path / name, frames, 25.0, RENDER)
+    write_browser_video(tmp_path / name, np.zeros((3, 16, 16, 3), np.uint8), 25.0, RENDER)
     with av.open(str(tmp_path / name)) as container:
         tags = {name.lower(): text for name, text in container.metadata.items()}
     assert tags["comment"] == note(RENDER)
-
-
-def test_an_odd_size_is_refused_for_h264(tmp_path):
-    pytest.importorskip("av")
-    with pytest.raises(InputError, match="17x16"):
-        write_browser_video(tmp_path / "a.mp4", np.zeros((3, 16, 17, 3), np.uint8), 25.0, RENDER)
-    assert not (tmp_path / "a.mp4").exists()
+    with pytest.raises(InputError, match="17x16") if name == "a.mp4" else nullcontext():
+        write_browser_video(tmp_path / name, np.zeros((3, 16, 17, 3), np.uint8), 25.0, RENDER)
 
 
 def test_a_ply_says_it_behind_its_properties(tmp_path):

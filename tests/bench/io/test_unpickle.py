@@ -1,11 +1,9 @@
 """The restricted unpickler: reads what FLAME's and trackers' files hold, and refuses whatever could run code."""
 
-import builtins
 import copyreg
 import io
 import os
 import pickle
-import zipfile
 
 import numpy as np
 import pytest
@@ -68,12 +66,6 @@ def test_reads_what_python_2_wrote(tmp_path):
     np.testing.assert_array_equal(content["coo"], MATRICES["coo"].toarray())
 
 
-def test_sums_repeated_entries_as_scipy_does(tmp_path):
-    matrix = scipy.sparse.coo_matrix(([1.0, 2.0, 4.0], ([0, 0, 1], [1, 1, 0])), shape=(2, 2))
-    (tmp_path / "x.pkl").write_bytes(pickle.dumps({"x": matrix}))
-    np.testing.assert_array_equal(read_pickle(tmp_path / "x.pkl")["x"], [[0, 3], [4, 0]])
-
-
 class Call:
     """Pickles as a call."""
 
@@ -98,9 +90,7 @@ ATTACKS = {
     "os.system": Call(os.system, "true"),
     "eval": Call(eval, "1"),
     "getattr": Call(getattr, np.zeros(1), "tofile"),
-    "import": Call(builtins.__import__, "os"),
     "numpy.load": Call(np.load, "x.npy"),
-    "numpy.frompyfunc": Call(np.frompyfunc, len, 1, 1),
     "scipy function": Call(scipy.sparse.load_npz, "x"),
     "other sparse": scipy.sparse.eye(3, format="dok"),
     "object array": np.array([{}], dtype=object),
@@ -120,9 +110,7 @@ REFUSED = {
         for protocol in (0, 5)
     },
     "altered function": ARRAY + b"(dS'_call'\nS'x'\nsb.",
-    "function with slots": ARRAY + b"(N(dS'_call'\nS'x'\nstb.",
     "altered class": b"cchumpy.ch\nCh\n(dS'array'\nS'x'\nsb.",
-    "altered array class": b"cnumpy\nndarray\n(dS'x'\nS'x'\nsb.",
     "altered codec": b"c_codecs\nencode\n(N(dS'mark'\nI1\nstb.",
     "chumpy without a state": b"(dS'x'\n(ichumpy.ch\nCh\ns.",
     "function as data": b"(dS'x'\n" + ARRAY + b"s.",
@@ -203,28 +191,8 @@ def test_reads_dictionaries_inside_a_dictionary_of_torch(tmp_path):
     assert (found["frame"], float(found["scalar"])) == ("00012", 2.5)
 
 
-def zipped(**members):
-    def write(path):
-        with zipfile.ZipFile(path, "w") as archive:
-            for name, content in members.items():
-                archive.writestr(f"{name}/data.pkl", content)
-
-    return write
-
-
-@pytest.mark.parametrize(
-    "write",
-    [
-        lambda path: torch.save({"x": torch.zeros(3)}, path),
-        lambda path: torch.save({"x": torch.nn.Linear(1, 1)}, path),
-        lambda path: torch.save([SINGLE], path),
-        lambda path: torch.save(CONTENT, path, _use_new_zipfile_serialization=False),
-        zipped(),
-        zipped(a=b"", b=b""),
-        zipped(a=b"\x80\x02}q"),
-    ],
-)
-def test_other_files_of_torch_are_refused(tmp_path, write):
-    write(tmp_path / "x.frame")
+@pytest.mark.parametrize("content", [{"x": torch.zeros(3)}, {"x": torch.nn.Linear(1, 1)}, [SINGLE]], ids=type)
+def test_other_files_of_torch_are_refused(tmp_path, content):
+    torch.save(content, tmp_path / "x.frame")
     with pytest.raises(InputError, match=r"x\.frame"):
         read_saved(tmp_path / "x.frame")

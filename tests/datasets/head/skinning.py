@@ -1,32 +1,39 @@
-"""Linear blend skinning in loops, written from the definition of FLAME: independent of the head model under test."""
+"""Linear blend skinning by 4x4 matrices, written from FLAME's definition: independent of the head model under test."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-PARENTS = (-1, 0, 1, 1, 1)
+STILL = (0.0, 0.0, 0.0)
 
 
-def skinned(head, expression, *, jaw=(0, 0, 0), eyes=(0,) * 6, eyelids=(0, 0), shape=None):
-    """(V, 3) vertices of a head that does not move as a whole, metres."""
-    neutral = np.asarray(head.template, np.float64)
-    if shape is not None:
-        neutral = neutral + head.shape_basis @ shape
-    shaped = neutral + head.expression_basis[:, :, : len(expression)] @ np.asarray(expression, np.float64)
+def skinned(
+    head,
+    expression=(),
+    *,
+    shape=(),
+    offset=0.0,
+    rotation=STILL,
+    neck=STILL,
+    jaw=STILL,
+    eyes=STILL * 2,
+    translation=STILL,
+    eyelids=(0.0, 0.0),
+):
+    """(V, 3) float64 vertices of one pose, metres."""
+    shaped = np.asarray(head.template, np.float64) + offset
+    for basis, values in ((head.shape_basis, shape), (head.expression_basis, expression)):
+        shaped = shaped + basis[:, :, : len(values)] @ np.asarray(values, np.float64)
     joints = head.joint_regressor @ shaped
-    turns = [np.eye(3), np.eye(3)]
-    turns += [Rotation.from_rotvec(part).as_matrix() for part in (jaw, eyes[:3], eyes[3:])]
-    feature = np.concatenate([(turn - np.eye(3)).ravel() for turn in turns[1:]])
-    posed = shaped + head.pose_basis @ feature
+    turns = [Rotation.from_rotvec(part).as_matrix() for part in (rotation, neck, jaw, eyes[:3], eyes[3:])]
+    posed = shaped + head.pose_basis @ np.concatenate([(turn - np.eye(3)).ravel() for turn in turns[1:]])
     motions = []
-    for joint, parent in enumerate(PARENTS):
-        local = np.eye(4)
-        local[:3, :3] = turns[joint]
-        local[:3, 3] = joints[joint] - (joints[parent] if parent >= 0 else 0)
-        motions.append(local if parent < 0 else motions[parent] @ local)
+    for joint, parent in enumerate((-1, 0, 1, 1, 1)):
+        about = np.eye(4)
+        about[:3, :3], about[:3, 3] = turns[joint], joints[joint] - turns[joint] @ joints[joint]
+        motions.append(about if parent < 0 else motions[parent] @ about)
     result = np.zeros_like(posed)
-    for joint, motion in enumerate(motions):
-        moved = (posed - joints[joint]) @ motion[:3, :3].T + motion[:3, 3]
-        result += head.skinning_weights[:, joint, None] * moved
+    for weights, motion in zip(head.skinning_weights.T, motions):
+        result += weights[:, None] * (posed @ motion[:3, :3].T + motion[:3, 3])
     if head.eyelid_basis is not None:
-        result += head.eyelid_basis @ np.asarray(eyelids, np.float64)
-    return result
+        result += (head.eyelid_basis @ np.asarray(eyelids, np.float64)) @ (turns[0] @ turns[1]).T
+    return result + translation

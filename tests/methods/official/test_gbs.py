@@ -2,12 +2,14 @@
 
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from headbench.bench.contracts import Budget
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_pixels
 from headbench.datasets.images import write_image
@@ -36,6 +38,20 @@ def exported(method, moving_clip, tmp_path):
 def read_frame(work, number):
     with torch.serialization.safe_globals([np.ndarray]):
         return torch.load(work.input / f"checkpoint/{number:05d}.frame", weights_only=True)
+
+
+def test_the_schedule_keeps_its_fractions_of_a_shorter_run(method, exported):
+    run = SimpleNamespace(budget=Budget(iterations=2_000))
+    words = method.train_command(run, exported[0])[2:]
+    options = dict(zip(words[::2], words[1::2], strict=True))
+    expected = {
+        "position_lr_max_steps": 1_500,
+        "densify_from_iter": 25,
+        "densify_until_iter": 750,
+        "opacity_reset_interval": 150,
+        "test_iterations": 0,
+    }
+    assert {name: int(options[f"--{name}"]) for name in expected} == expected
 
 
 def test_frames_hold_pose_and_both_cameras_in_the_heads_frame(exported, moving_clip):
