@@ -56,8 +56,13 @@ AVATAR_TABLES = {
 
 
 def suite_runs(folder: Path, base: str = RUN) -> list[Path]:
-    """Folders of a suite's finished runs of one kind, one for each subject."""
-    return [each for each in sorted((folder / base).glob("*")) if RunFolder(each).rows.is_file()]
+    """Folders of a suite's finished runs of one kind, one for each subject.
+
+    A suite of earlier versions has one run for all subjects.
+    """
+    place = folder / base
+    places = [place, *sorted(place.iterdir())] if place.is_dir() else []
+    return [each for each in places if RunFolder(each).rows.is_file()]
 
 
 def suite_report(folder: Path, method: str, read: Callable[[Sequence[Path]], RunSet] = RunSet.read) -> str:
