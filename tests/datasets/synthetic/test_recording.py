@@ -150,18 +150,15 @@ def test_a_matte_displaces_the_outline_of_hair(level):
     assert (found - alpha).min() < -0.3 * min(level, 1.0)
 
 
-def test_a_matte_keeps_what_is_not_hair():
+def test_a_matte_keeps_what_is_not_hair_and_no_single_hair():
     alpha, _ = disc(40.0)
     left = np.zeros(alpha.shape)
     left[:, :60] = 1.0
     found = matte(alpha, left, 1.0, METRE, 3)
     np.testing.assert_array_equal(found[:, 60:], alpha[:, 60:])
     np.testing.assert_array_equal(matte(np.zeros((9, 9)), np.ones((9, 9)), 1.0, METRE, 3), np.zeros((9, 9)))
-
-
-def test_a_single_hair_is_lost():
     alpha, _ = disc(30.0)
-    alpha[60, 95:110] = 1.0  # as thick as a pixel, a quarter of what a matte keeps
+    alpha[60, 95:110] = 1.0  # a hair as thick as a pixel, a quarter of what a matte keeps, is lost
     assert matte(alpha, np.ones(alpha.shape), 1.0, METRE, 3)[60, 98:108].max() < 0.5
 
 
