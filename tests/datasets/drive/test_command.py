@@ -163,13 +163,6 @@ def npz(**arrays):
     return "bad.npz"
 
 
-def arrays():
-    Path("arrays").mkdir()
-    for name in ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation"):
-        np.save(f"arrays/{name}.npy", np.zeros((FRAMES, 3)))
-    return "arrays"
-
-
 def mapped(text, table="a,b\n1,2\n"):
     Path("map.yaml").write_text(text)
     return csv(table)
@@ -177,6 +170,15 @@ def mapped(text, table="a,b\n1,2\n"):
 
 ONE = np.zeros((FRAMES, 8))
 MAP = ("--map", "map.yaml")
+
+
+def arrays():
+    """A folder of frames that are no parameter files."""
+    Path("arrays").mkdir()
+    np.save("arrays/0.npy", np.zeros(5))
+    return "arrays"
+
+
 REFUSED = {
     "no file": (lambda: "none.csv", (), "no such file"),
     "empty csv": (lambda: csv(""), (), "empty file"),
@@ -214,7 +216,11 @@ REFUSED = {
     "two numbers": (lambda: lines('{"jawOpen": [0.1, 0.9]}'), (), "jawOpen: expected one number"),
     "no blendshape": (lambda: csv("time\n0\n"), ("--form", "blendshapes"), "a column with ARKit's name"),
     "a shape twice": (lambda: csv("jawOpen,JawOpen\n0.5,0.1\n"), (), "one column for jawOpen, found two"),
-    "arrays as parameters": (arrays, ("--form", "flame_param", "--signal-head", "avatar"), "arrays"),
+    "arrays as parameters": (
+        arrays,
+        ("--form", "flame_param", "--signal-head", "avatar"),
+        ".npz file of parameters",
+    ),
     "a missing head": (lambda: "signal.npz", ("--signal-head", "typo.pkl"), "--signal-head"),
     "no map": (lambda: csv("jawOpen\n1\n"), ("--map", "none.yaml"), "none.yaml"),
     "an unknown head": (lambda: "signal.npz", ("--signal-head", "2021"), "2020, 2023"),
