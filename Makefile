@@ -89,7 +89,7 @@ test-latest:
 	test -x $(VENV)-latest/bin/python || $(PYTHON) -m venv $(VENV)-latest
 	$(VENV)-latest/bin/python -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager -e '.[dev,docs]'
 	$(VENV)-latest/bin/python -m pip list
-	$(VENV)-latest/bin/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
+	$(VENV)-latest/bin/python -m pytest -m "not slow and not slurm" -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 check: setup
 	$(BIN)/ruff check .

@@ -147,8 +147,7 @@ class Manifest:
         In the order of the configuration; protocols by task, in files of their own.
     machine : dict[str, Any]
         Processor, cores, memory in bytes, system, package versions and accelerators; for a run on a
-        CUDA device, also the device, CUDA's version and whether TF32 was enabled, except in old
-        records. See `machine_record`.
+        CUDA device, also the device, CUDA's version and whether TF32 was enabled. See `machine_record`.
     seconds, peak_memory_bytes : float | None, int | None
         Of the last start of the run; None until it has ended.
     adapted : tuple[AdaptedRecord, ...]

@@ -86,7 +86,7 @@ def run_program(
     """Run a command in ``folder`` until it ends; its output, both streams, is appended to ``log``.
 
     Its process group is terminated when it ends or this call is interrupted. A process that keeps the output open is
-    not waited for. Files written for it are flushed to disk before, even inside a group of writes.
+    not waited for.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ class Row:
     ``condition`` names the changes from the plain comparison, see `bench.condition.Condition`; "" for none.
 
     ``machine``, ``threads`` and ``other_cores`` are recorded for times only, see `machine.ProcessorLoad`;
-    elsewhere, and in older records, they are "", 0 and NaN.
+    elsewhere they are "", 0 and NaN.
     """
 
     method: str

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from ..bench.contracts import FrameKey
-from ..bench.manifest import ClipRecord, Manifest
+from ..bench.manifest import Manifest
 
 SPLIT_TASK = "self_reenactment"
 
@@ -29,25 +29,18 @@ def explained(keys: Collection[FrameKey], unseen: Collection[tuple[str, str]]) -
 def unseen_cameras(
     manifests: Sequence[Manifest], keys: Collection[FrameKey]
 ) -> tuple[frozenset[tuple[str, str]], str]:
-    """The (subject, camera) pairs of self-reenactment without training frames; none and a reason if unknown.
-
-    The reason is one sentence, for captions.
+    """The (subject, camera) pairs of self-reenactment without training frames; none and a reason, one sentence, if
+    they are all, none, or not the same in all runs.
     """
     unseen = set()
     cameras = {(key.subject, key.camera) for key in keys}
     for subject in {key.subject for key in keys}:
-        found = [
-            _seen(manifest, clip, {camera for name, camera in cameras if name == subject})
-            for manifest in manifests
-            for clip in manifest.clips
-            if clip.subject == subject
-        ]
-        known = {frozenset(seen) for seen in found if seen is not None}
-        if len(known) != 1:
-            what = "differ in" if known else "do not record"
-            return frozenset(), _one_column(f"the runs {what} which cameras were trained on")
-        (seen,) = known
-        unseen |= {(name, camera) for name, camera in cameras if name == subject and camera not in seen}
+        clips = (clip for manifest in manifests for clip in manifest.clips if clip.subject == subject)
+        own = {camera for name, camera in cameras if name == subject}
+        seen = {frozenset(own & {*clip.training_cameras}) for clip in clips}
+        if len(seen) != 1:
+            return frozenset(), _one_column("the runs differ in which cameras were trained on")
+        unseen |= {(subject, camera) for camera in own.difference(*seen)}
     if not unseen:
         return frozenset(), _one_column("methods are trained on all of its cameras") if keys else ""
     if len(unseen) == len(cameras):
@@ -57,15 +50,3 @@ def unseen_cameras(
 
 def _one_column(why: str) -> str:
     return f"Self-reenactment is not split into seen and unseen cameras: {why}."
-
-
-def _seen(manifest: Manifest, clip: ClipRecord, cameras: set[str]) -> set[str] | None:
-    """The training cameras among a subject's ``cameras``; None if they are not recorded."""
-    if clip.training_cameras:
-        return cameras & {*clip.training_cameras}
-    # Older records have no cameras: novel views are the frames of all held-out cameras.
-    views = manifest.protocols.get("novel_view")
-    own = [key for key in views.keys if key.subject == clip.subject] if views else []
-    if len(own) != clip.splits.get("novel_view", 0):
-        return None  # Only some frames were scored, perhaps not of every held-out camera.
-    return cameras - {key.camera for key in own}

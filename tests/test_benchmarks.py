@@ -19,6 +19,7 @@ SMALLEST = {
 }
 
 
+@pytest.mark.commands
 @pytest.mark.parametrize("measure", SMALLEST, ids=lambda f: f"{f.__module__}.{f.__name__}")
 def test_a_benchmark_has_every_row(measure, monkeypatch):
     sizes, rows = SMALLEST[measure]

@@ -247,7 +247,7 @@ CASES = {
             "theirs/run.json",
         ),
         case(
-            f"evaluate --avatar {cell('ours')}/avatar --data {{capture}} --out stored --frames-per-task 1",
+            f"evaluate --avatar {cell('ours')}/avatar --clip {{capture}} --out stored --frames-per-task 1",
             r"(?s)Storage.*\| ours ",
             "stored/rows.parquet",
         ),
@@ -391,7 +391,7 @@ CASES = {
         case(
             f"{PREPARE} --subjects 901 --sequences all --downscale 1 --out prepared",
             "FREE",
-            "prepared/UNION2_901/transforms_train.json",
+            "prepared",
         )
     ],
     "doctor bench": [case("doctor bench splats --quick --tradeoffs --out bench.json", "knob", "bench.json")],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import tyro
 
@@ -51,7 +50,7 @@ class EvaluateSettings(ExecutionOptions):
     out: str
     """Folder to write: a run with one method, which `table`, `compare`, `verify` and every report can read."""
 
-    clip: Annotated[str | None, tyro.conf.arg(aliases=["--data"])] = None
+    clip: str | None = None
     """Capture to score against (or folder of several); default: that of the run named by --like."""
 
     label: str = ""

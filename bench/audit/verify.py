@@ -176,7 +176,11 @@ def _verify_cell(
         (scored.cell.folder / "renders").symlink_to((job.cell.folder / "renders").resolve())
         measured = measure(scored, avatar, again)
     new = measured.select(method=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL, condition=ALL)
-    _compare(job.run / "rows.parquet", rows, new, again, found)
+    recorded, now = ({*table.loc[table["status"] == "ok", "metric"]} for table in (rows, new))
+    lost = new[new["metric"].isin(recorded - now)].groupby("metric")["reason"].first()
+    found.unverified |= {str(name): str(reason) for name, reason in lost.items()}
+    known = [metric for metric in again if metric.name not in lost]
+    _compare(job.run / "rows.parquet", rows, new, known, found)
 
 
 def _can_be_scored(job: Job, path: Path) -> bool:

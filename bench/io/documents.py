@@ -65,7 +65,8 @@ def read_yaml(path: Path) -> dict[Any, Any]:
     `read_json` does, and for other tags.
     """
     value = parse_setting(read_text(path, "YAML"), path, "")
-    _check_finite(value, path, "")
+    with reading(path, "valid YAML"):  # a list may contain itself
+        _check_finite(value, path, "")
     if value is None:
         return {}
     if not isinstance(value, dict):

@@ -33,6 +33,8 @@ def read_flame_parameters(request: SignalRequest) -> DrivingSignal:
     head = find_head(path.parent, declaration, None) if declaration else request.head(DEFAULT_HEAD)
     if path.is_dir():
         files = dict(enumerate(sorted(path.glob("*.npz"), key=natural_order)))
+        if not files:
+            raise InputError(path, "", "a .npz file of parameters for each frame", "none")
         tracking = read_tracking(files, head, "")
     else:
         tracking = read_animation(path, head)

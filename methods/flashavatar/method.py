@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from ...bench.contracts import Clip, FloatArray, HeadPose
-from ..avatars.compact.offsets import read_offsets
+from ..avatars.compact.layouts import offsets, read_coded
 from ..avatars.harmonics import turn_harmonics
 from ..ops.harmonics import coefficient_count, turned_colors
 from ..ops.mesh import TriangleFrames
@@ -111,7 +111,7 @@ def image_loss(image: Tensor, truth: Tensor, mouth: Tensor | None, config: Flash
 class FlashAvatarAvatar(SurfaceAvatar[TrainedSplats]):
     """A trained head; see `SurfaceAvatar` for its files."""
 
-    stored_class, read_coded = TrainedSplats, read_offsets
+    stored_class, read_coded = TrainedSplats, partial(read_coded, layout=offsets)
 
     @cached_property
     def _of_points(self) -> Tensor:

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from ...bench.contracts import Clip, FloatArray, HeadPose
-from ...datasets.head.arrays import HeadArrays
-from ..avatars.compact.bound import read_bound
+from ..avatars.compact.layouts import bound, read_coded
 from ..ops.harmonics import (
     coefficient_count,
     harmonic_colors,
@@ -25,7 +24,17 @@ from ..ops.harmonics import (
 )
 from ..ops.mesh import TriangleFrames
 from ..ops.splats import activate, to_world
-from ..shared.avatar_files import TRACKED, RefinedTracking, Subject, clip_mesh, finish_fit, read_stored
+from ..shared.avatar_files import (
+    COMPACT_FILE,
+    SUBJECT_FILE,
+    TRACKED,
+    RefinedTracking,
+    Subject,
+    clip_mesh,
+    finish_fit,
+    read_shared_head,
+    read_subject,
+)
 from ..shared.capacity import CapacityPlan, CapacityPlanner
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
@@ -36,7 +45,7 @@ from ..shared.splat_training import BoundTraining, ShadedSplats
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, TrainingPoses
 from .config import GAConfig
 from .spec import GA as SPEC
-from .storage import PLY_FILE, read_ga_splats, write_ga_splats
+from .storage import PLY_FILE, checked_splats, read_ga_splats, write_ga_splats
 
 DRIVING_FILE = "driving.npz"
 STORED_DEGREE = 3  # the PLY layout has degree 3, regardless of the trained degree
@@ -145,12 +154,15 @@ class GAAvatar(StoredSplatAvatar):
     @classmethod
     def read(cls, folder: Path, device: str) -> GAAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
-
-        def exact(path: Path, head: HeadArrays) -> tuple[dict[str, Tensor], Tensor]:
-            return read_ga_splats(path, len(head.faces), device)
-
-        coded = partial(read_bound, device=device)
-        stored, head, subject, (splats, binding) = read_stored(folder, PLY_FILE, exact, coded)
+        head, coded = read_shared_head(folder), folder / COMPACT_FILE
+        faces = len(head.faces)
+        if coded.exists():
+            stored, (subject, tensors, _) = [coded], read_coded(coded, head, bound)
+            splats, binding = checked_splats(coded, tensors, faces, device)
+        else:
+            stored = [folder / PLY_FILE, folder / SUBJECT_FILE]
+            subject = read_subject(stored[1], head)
+            splats, binding = read_ga_splats(stored[0], faces, device)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         driving = folder / DRIVING_FILE
         refined = RefinedTracking.read(driving) if driving.exists() else None

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from ...bench.errors import InputError
-from ...bench.io.arrays import check_numbers
+from ...bench.io.arrays import Member
 from ..ops.harmonics import coefficient_count
 from ..shared.ply import read_names, read_ply, write_ply
-from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors
 
 PLY_FILE = "point_cloud.ply"
 
@@ -27,6 +27,18 @@ COLUMNS = (
 )
 """63 float32 = 252 bytes per splat: local position, zero normals, spherical harmonics (the rest channel by
 channel), logit of opacity, log-scales, quaternion wxyz, triangle."""
+
+
+BINDING = "binding"
+SHAPES: dict[str, tuple[int | str | None, ...]] = {
+    "means": ("N", 3),
+    "log_scales": ("N", 3),
+    "quats": ("N", 4),
+    "opacities": ("N",),
+    "sh_dc": ("N", 3),
+    "sh_rest": ("N", 3, None),
+}
+"""Shapes of the per-splat tensors."""
 
 
 def write_ga_splats(path: Path, splats: dict[str, Tensor], binding: Tensor) -> None:
@@ -59,23 +71,28 @@ def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, 
     rest_names = tuple(name for name in COLUMNS if name.startswith("f_rest_"))
     needed = tuple(name for name in COLUMNS if name not in (*normals, *rest_names))
     degree_rest = _rest_count(path)
-    names = (*needed, *rest_names[: 3 * degree_rest])
-    table = torch.from_numpy(read_ply(path, names))
-    binding = table[:, needed.index("binding_0")].to(torch.int64)
-    for column, name in enumerate(names):
-        if name != "binding_0":
-            check_numbers(path, name, table[:, column].numpy(), MAX_MAGNITUDE)
-    check_sizes(path, table[:, [needed.index(f"scale_{i}") for i in range(3)]])
-    if len(binding) and not (0 <= int(binding.min()) and int(binding.max()) < face_count):
-        found = f"{int(binding.min())} to {int(binding.max())}"
-        raise InputError(path, "binding_0", f"triangles 0 to {face_count - 1}", found)
+    table = torch.from_numpy(read_ply(path, (*needed, *rest_names[: 3 * degree_rest])))
     widths = [3, 3, 1, 3, 4, 1, 3 * degree_rest]
-    means, dc, opacity, log_scales, quats, _, rest = table.to(device).split(widths, dim=1)
+    means, dc, opacity, log_scales, quats, binding, rest = table.split(widths, dim=1)
     filled = rest.new_zeros(len(rest), 3, REST)
     filled[:, :, :degree_rest] = rest.reshape(len(rest), 3, degree_rest)
     geometry = {"means": means, "log_scales": log_scales, "quats": quats, "opacities": opacity[:, 0]}
-    splats = {**geometry, "sh_dc": dc, "sh_rest": filled}
-    return {name: value.contiguous() for name, value in splats.items()}, binding.to(device)
+    tensors = {**geometry, "sh_dc": dc, "sh_rest": filled, BINDING: binding[:, 0].to(torch.int64)}
+    return checked_splats(path, tensors, face_count, device)
+
+
+def checked_splats(
+    path: Path, tensors: dict[str, Tensor], face_count: int, device: str
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Per-splat tensors and the binding. Raises `InputError` for tensors that do not fit each other or the mesh."""
+    members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in SHAPES.items()}
+    check_tensors(path, tensors, members | {BINDING: Member("i", ("N",))})
+    check_sizes(path, tensors["log_scales"])
+    binding = tensors[BINDING]
+    if len(binding) and not (0 <= int(binding.min()) and int(binding.max()) < face_count):
+        found = f"{int(binding.min())} to {int(binding.max())}"
+        raise InputError(path, BINDING, f"triangles 0 to {face_count - 1}", found)
+    return {name: tensors[name].contiguous().to(device) for name in members}, binding.to(device)
 
 
 def _rest_count(path: Path) -> int:

@@ -9,14 +9,13 @@ from pathlib import Path
 import torch
 
 from ...bench.contracts import FloatArray, HeadPose, no_stage
-from ...datasets.head.arrays import HeadArrays
-from ..avatars.compact.blended import read_blended
+from ..avatars.compact.layouts import blended, read_coded
 from ..avatars.harmonics import turn_harmonics
 from ..ops.harmonics import sh_degree
 from ..shared.avatar_files import AVATAR_FILE, Subject, read_stored
 from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from .blendshapes import PointMotions, PosedAttributes, Rig, apply_pose
-from .storage import Stored, read_avatar
+from .storage import Stored, stored_of
 
 
 class GBSAvatar(StoredSplatAvatar):
@@ -34,12 +33,8 @@ class GBSAvatar(StoredSplatAvatar):
     @classmethod
     def read(cls, folder: Path, device: str) -> GBSAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
-
-        def exact(path: Path, head: HeadArrays) -> Stored:
-            return read_avatar(path, len(head.faces), head.expression_basis.shape[2], device)
-
-        coded = partial(read_blended, device=device)
-        files, head, subject, stored = read_stored(folder, AVATAR_FILE, exact, coded)
+        content_of, coded = partial(stored_of, device=device), partial(read_coded, layout=blended)
+        files, head, subject, stored = read_stored(folder, AVATAR_FILE, content_of, coded)
         rig = Rig(head, subject.shape, subject.static_offset, stored.points, stored.expressions, device)
         return cls(files, subject, rig, stored, device)
 

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import IntArray
+from ...bench.contracts import HeadAsset, IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ..ops.harmonics import coefficient_count
 from ..shared.surface_points import POINT_MEMBERS, SurfacePoints, point_tensors, take_points
-from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors, write_tensors
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, write_tensors
 from .blendshapes import Entries, difference_widths
 
 EXPRESSIONS = "expressions"
@@ -79,10 +79,11 @@ def write_avatar(
     write_tensors(path, tensors, {EXPRESSIONS: str(expressions)})
 
 
-def read_avatar(path: Path, face_count: int, expression_size: int, device: str) -> Stored:
-    """Read and check what `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
-    tensors, metadata = read_safetensors(path)
-    said = metadata.get(EXPRESSIONS, "")
+def stored_of(
+    path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str], head: HeadAsset, device: str
+) -> Stored:
+    """Check the content of a file that `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+    said, expression_size = metadata.get(EXPRESSIONS, ""), head.expression_basis.shape[2]
     if not said.isdecimal() or len(said) > 9 or int(said) > expression_size:
         raise InputError(path, EXPRESSIONS, f"a number up to {expression_size}", repr(said[:20]))
     expressions = int(said)
@@ -93,7 +94,7 @@ def read_avatar(path: Path, face_count: int, expression_size: int, device: str) 
     neutral = {name: column.contiguous() for name, column in zip((*GEOMETRY, "sh_rest"), columns)}
     neutral["opacities"] = neutral["opacities"][:, 0]
     neutral["sh_rest"] = neutral["sh_rest"].reshape(len(counts), 3, -1)
-    points = take_points(path, tensors, face_count)
+    points = take_points(path, tensors, len(head.faces))
     entries = Entries.of(counts, torch.from_numpy(moving).to(device), torch.ones(len(owners), device=device))
     return Stored(neutral, points, expressions, entries, tensors["differences"].to(device))
 

@@ -15,8 +15,8 @@ from ...bench.contracts import Camera, FloatArray, Frame, HeadAsset, HeadPose, n
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.native.dispatch import to_device
-from ..avatars.compact.container import codec_of, read_content
-from ..avatars.compact.networks import as_tensors, read_networks
+from ..avatars.compact.container import codec_of
+from ..avatars.compact.layouts import networks, read_coded
 from ..shared.avatar_files import (
     AVATAR_FILE,
     RefinedTracking,
@@ -26,7 +26,7 @@ from ..shared.avatar_files import (
     settings_text,
 )
 from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back, splat_depth
-from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors, write_tensors
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, write_tensors
 from ..shared.threads import torch_on_one_thread
 from ..splats.cpu import instruction_sets
 from .config import GHAConfig
@@ -68,8 +68,8 @@ class GHAAvatar:
     @classmethod
     def read(cls, folder: Path, device: str) -> GHAAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
-        readers = partial(read_avatar, device=device), partial(read_coded, device=device)
-        files, shared, subject, (head, tensors) = read_stored(folder, AVATAR_FILE, *readers)
+        content_of, coded = partial(avatar_of, device=device), partial(read_coded, layout=networks)
+        files, shared, subject, (head, tensors) = read_stored(folder, AVATAR_FILE, content_of, coded)
         driver = Driver(
             *(shared, subject.shape, subject.static_offset),
             origin=tensors["origin"].cpu().numpy(),
@@ -181,23 +181,17 @@ def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -
     write_tensors(path, kept, {CONFIG: settings_text(config, RENDERING)})
 
 
-def read_avatar(path: Path, shared: HeadAsset, device: str) -> tuple[GaussianHead, dict[str, Tensor]]:
-    """Read what `write_avatar` wrote: the networks and their tensors, and those of the points."""
-    (tensors, metadata), size = read_safetensors(path), code_size(shared)
+def avatar_of(
+    path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str], shared: HeadAsset, device: str
+) -> tuple[GaussianHead, dict[str, Tensor]]:
+    """The networks, and their tensors and those of the points, of a file that `write_avatar` wrote.
+
+    Raises `InputError` if a tensor is missing, does not fit the settings, or is not finite float32.
+    """
+    size = code_size(shared)
     config = settings_of_text(GHAConfig, RENDERING, metadata.get(CONFIG, ""), path, CONFIG)
     head = GaussianHead.of(config, size)
     return head, _checked(path, tensors, head, size, device)
-
-
-def read_coded(
-    path: Path, shared: HeadAsset, device: str
-) -> tuple[Subject, tuple[GaussianHead, dict[str, Tensor]]]:
-    """The same, with the subject, of a coded file (`compact.networks`)."""
-    content, size = read_content(path), code_size(shared)
-    config = settings_of_text(GHAConfig, RENDERING, content.text.get(CONFIG, ""), path, CONFIG)
-    head = GaussianHead.of(config, size)
-    subject, arrays = read_networks(path, shared, _shapes(head, size), TABLE, content)
-    return subject, (head, _checked(path, as_tensors(arrays, "cpu"), head, size, device))
 
 
 TABLE = "table"

@@ -12,14 +12,13 @@ import torch
 from torch import Tensor
 
 from ...bench.configuration import build
-from ...bench.contracts import Camera, Frame, HeadAsset, HeadPose
+from ...bench.contracts import Camera, Frame, HeadPose
 from ...bench.errors import HeadbenchError, InputError
-from ...bench.io.arrays import Member, read_arrays
+from ...bench.io.arrays import Member, check_arrays, read_npz
 from ...bench.io.documents import parse_json, read_json
 from ...bench.native.dispatch import fits
-from ..avatars.compact.container import Arrays, Content, codec_of, read_content
-from ..avatars.compact.file import decode_subject
-from ..avatars.compact.networks import as_tensors, read_networks
+from ..avatars.compact.container import codec_of
+from ..avatars.compact.layouts import grid, read_coded
 from ..shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, read_shared_head, read_subject, write_arrays
 from ..shared.subject_mesh import SubjectMesh, pose_key
 from ..shared.threads import threads
@@ -68,24 +67,21 @@ class InstaAvatar:
     def read(cls, folder: Path, device: str) -> InstaAvatar:
         """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
         head, coded = read_shared_head(folder), folder / COMPACT_FILE
-        content = read_content(coded) if coded.exists() else None
-        if content is not None:
-            files = [coded]
-            subject = decode_subject(Arrays(coded, content), head)
-            config = _settings(parse_json(content.text.get(SETTINGS, ""), coded, SETTINGS), coded)
+        if coded.exists():
+            files, (subject, tensors, text) = [coded], read_coded(coded, head, grid)
+            arrays = {name: value.numpy() for name, value in tensors.items()}
+            config = _settings(parse_json(text.get(SETTINGS, ""), coded, SETTINGS), coded)
         else:
             files = [folder / name for name in (FIELD_FILE, SETTINGS_FILE, SUBJECT_FILE)]
             subject = read_subject(folder / SUBJECT_FILE, head)
             config = read_settings(folder / SETTINGS_FILE)
+            arrays = read_npz(folder / FIELD_FILE)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
         surface = canonical_surface(head, mesh, config)
         occupancy = Occupancy(surface, config)
         architecture = Architecture.of(config, mesh.model.expression_size)
         size = tuple(int(side) for side in occupancy.size)
-        if content is not None:
-            parameters, cells = _read_coded(coded, head, content, architecture, size, device)
-        else:
-            parameters, cells = read_field(folder / FIELD_FILE, architecture, size, device)
+        parameters, cells = field_of(files[0], arrays, architecture, size, device)
         field = RadianceField(architecture, occupancy.box(device), Prior.of(config))
         space = occupied_space(occupancy, cells)
         return cls(files, mesh, config, field, parameters, space, surface.rest, mouth_triangles(head))
@@ -161,34 +157,22 @@ def write_field(path: Path, parameters: Mapping[str, Tensor], occupied: np.ndarr
     write_arrays(path, {**arrays, OCCUPIED: bits})
 
 
-def read_field(
-    path: Path, architecture: Architecture, size: tuple[int, ...], device: str
-) -> tuple[dict[str, Tensor], np.ndarray]:
-    """Read what `write_field` wrote: float32 parameters, and flat indices of occupied cells."""
-    shapes = architecture.shapes()
-    cells = math.prod(size)
-    members = {name: Member("f", shape, dtype="f2") for name, shape in shapes.items()}
-    arrays = read_arrays(path, {**members, OCCUPIED: Member("u", (-(-cells // 8),), dtype="u1")})
-    parameters = {name: torch.from_numpy(arrays[name].astype(np.float32)).to(device) for name in shapes}
-    return parameters, np.flatnonzero(np.unpackbits(arrays[OCCUPIED], count=cells))
-
-
-def _read_coded(
+def field_of(
     path: Path,
-    head: HeadAsset,
-    content: Content,
+    arrays: Mapping[str, np.ndarray],
     architecture: Architecture,
     size: tuple[int, ...],
     device: str,
 ) -> tuple[dict[str, Tensor], np.ndarray]:
-    """The same of the content of a coded file (`compact.networks`)."""
-    cells = math.prod(size)
-    shapes: dict[str, tuple[int | None, ...]] = {**architecture.shapes(), OCCUPIED: (-(-cells // 8),)}
-    _, arrays = read_networks(path, head, shapes, content=content)
-    bits = arrays.pop(OCCUPIED)
-    if bits.dtype != np.uint8:
-        raise InputError(path, OCCUPIED, "uint8", str(bits.dtype))
-    return as_tensors(arrays, device), np.flatnonzero(np.unpackbits(bits, count=cells))
+    """Float32 parameters, and flat indices of occupied cells, of the arrays of a file.
+
+    Raises `InputError` for an array that is missing, not finite or of another shape or type.
+    """
+    shapes, cells = architecture.shapes(), math.prod(size)
+    members = {name: Member("f", shape) for name, shape in shapes.items()}
+    check_arrays(path, arrays, {**members, OCCUPIED: Member("u", (-(-cells // 8),), dtype="u1")})
+    parameters = {name: torch.from_numpy(arrays[name].astype(np.float32)).to(device) for name in shapes}
+    return parameters, np.flatnonzero(np.unpackbits(arrays[OCCUPIED], count=cells))
 
 
 class RayColors(NamedTuple):

@@ -248,19 +248,21 @@ def _commit(folder: Path) -> tuple[str, dict[str, Any]]:
     if not top or Path(top).resolve() != folder:
         return "", {}
     commit = _git(folder, "rev-parse", "HEAD").strip()
-    difference = _git(folder, "diff", "--ignore-submodules", "HEAD")
+    compare = ("diff", "--no-ext-diff", "--no-textconv", "--ignore-submodules", "HEAD")
+    difference = _git(folder, *compare)
     if not difference:
         return commit, {"changed": []}
-    changed = _git(folder, "diff", "--ignore-submodules", "--name-only", "HEAD").split("\n")
+    changed = _git(folder, *compare, "--name-only").split("\n")
     digest = hashlib.sha256(difference.encode()).hexdigest()
     return commit, {"changed": [name for name in changed if name][:40], "difference": digest}
 
 
 def _git(folder: Path, *arguments: str) -> str:
-    """Output of git, "" if it fails."""
+    """Output of git, "" if it fails. Programs named in the checkout's configuration are not run."""
+    safe = ("-c", "core.fsmonitor=false", "-c", f"safe.directory={folder}")
     try:
         done = subprocess.run(
-            ["git", "-C", str(folder), "-c", f"safe.directory={folder}", *arguments],
+            ["git", "-C", str(folder), *safe, *arguments],
             check=False,
             capture_output=True,
             stdin=subprocess.DEVNULL,

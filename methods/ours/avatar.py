@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,12 @@ from torch import Tensor
 
 from ...bench.contracts import HeadPose
 from ...bench.native.dispatch import to_device
-from ..avatars.compact.file import read_compact
+from ..avatars.compact.field import field as field_layout
+from ..avatars.compact.layouts import read_coded
 from ..ops.harmonics import harmonic_shader
 from ..ops.planes import ENCODING_SIZE, Bounds, Shader, shader
 from ..ops.splats import activate, to_world
-from ..shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, Subject, read_shared_head, read_subject
+from ..shared.avatar_files import Subject, read_stored
 from ..shared.rendering import USUAL, Cutoffs, LastPose, PlacedSplats, StoredSplatAvatar
 from ..shared.subject_mesh import SubjectMesh
 from .appearance import driving_coefficients
@@ -30,7 +32,7 @@ from .field import (
     position_part,
 )
 from .inference import DrivenPose, LineOffsets
-from .storage import FIELD_FILE, RESIDUAL, StoredField, read_field, splat_columns
+from .storage import FIELD_FILE, RESIDUAL, StoredField, field_of, splat_columns
 
 
 class OursAvatar(StoredSplatAvatar):
@@ -85,18 +87,12 @@ class OursAvatar(StoredSplatAvatar):
         super().__init__(stored, LastPose(self._placed), device, cutoffs)
 
     @classmethod
-    def read(cls, folder: Path, device: str, *, exact: bool = False) -> OursAvatar:
-        """Read an avatar from its folder; ``exact`` reads the files of a training even if there is a coded one."""
-        head = read_shared_head(folder)
-        compact = folder / COMPACT_FILE
-        if compact.exists() and not exact:
-            subject, field = read_compact(compact, head, device)
-            mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
-            return cls([compact], mesh, subject, field, device)
-        subject = read_subject(folder / SUBJECT_FILE, head)
+    def read(cls, folder: Path, device: str) -> OursAvatar:
+        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
+        content_of, coded = partial(field_of, device=device), partial(read_coded, layout=field_layout)
+        files, head, subject, field = read_stored(folder, FIELD_FILE, content_of, coded)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
-        field = read_field(folder / FIELD_FILE, head, device)
-        return cls([folder / FIELD_FILE, folder / SUBJECT_FILE], mesh, subject, field, device)
+        return cls(files, mesh, subject, field, device)
 
     @torch.no_grad()
     def static_logits(self) -> Tensor:

@@ -75,13 +75,17 @@ def save_field(path: Path, field: StoredField) -> None:
 
 def read_field(path: Path, head: HeadAsset, device: str) -> StoredField:
     """Read and check what `save_field` wrote. Raises `InputError` if a tensor is missing or does not fit."""
-    tensors, metadata = read_safetensors(path)
-    field = checked_field(path, tensors, metadata.get(DYNAMIC, "opacity"), head)
-    return field._replace(tensors={name: value.to(device) for name, value in field.tensors.items()})
+    return field_of(path, *read_safetensors(path), head, device)
 
 
-def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: HeadAsset) -> StoredField:
-    """Build a field from untrusted tensors and the comma-separated attributes that the lines change."""
+def field_of(
+    path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str], head: HeadAsset, device: str
+) -> StoredField:
+    """Check the tensors and metadata of a file.
+
+    Raises `InputError` if a tensor is missing, is not finite float32 or does not fit the others.
+    """
+    names = metadata.get(DYNAMIC, "opacity")
     given = names.split(",")
     if len(set(given)) != len(given) or not set(given) <= set(WIDTHS):
         raise InputError(path, DYNAMIC, f"names among {', '.join(WIDTHS)}, each once", repr(names)[:80])
@@ -96,7 +100,7 @@ def checked_field(path: Path, tensors: dict[str, Tensor], names: str, head: Head
     number = Member("f", None, MAX_MAGNITUDE, "f4")
     check_tensors(path, tensors, dict.fromkeys([*needed, *tensors], number))
     _check_shapes(path, tensors, head, offset_width(dynamic))
-    return StoredField(tensors, dynamic)
+    return StoredField({name: value.to(device) for name, value in tensors.items()}, dynamic)
 
 
 def _check_shapes(path: Path, tensors: Mapping[str, Tensor], head: HeadAsset, outputs: int) -> None:

@@ -8,6 +8,7 @@ Training is on batches of images. Colours are taken from them at the start, and 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...bench.native.dispatch import to_device
-from ..avatars.compact.reduced import read_reduced
+from ..avatars.compact.layouts import read_coded, reduced
 from ..avatars.harmonics import DEGREE
 from ..ops.harmonics import C0, coefficient_count
 from ..ops.mesh import TriangleFrames
@@ -183,7 +184,7 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
 class RGBAvatarAvatar(SurfaceAvatar[StoredShapes]):
     """A trained head; see `SurfaceAvatar` for its files."""
 
-    stored_class, read_coded = StoredShapes, read_reduced
+    stored_class, read_coded = StoredShapes, partial(read_coded, layout=reduced)
 
     @torch.no_grad()
     def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:

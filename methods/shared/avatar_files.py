@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
+from torch import Tensor
 
 from ...bench.configuration import build, deciding_settings
 from ...bench.contracts import Budget, Clip, FloatArray, HeadAsset, HeadPose
@@ -20,6 +21,7 @@ from ...bench.io.files import atomic_path, digest, write_json
 from ...datasets.head.arrays import OPTIONAL, STORED, HeadArrays, read_head, save_head
 from .loop import Fit, TrainingSummary
 from .subject_mesh import SubjectMesh
+from .tensor_files import read_safetensors
 
 Content = TypeVar("Content")
 AVATAR_FILE = "avatar.safetensors"
@@ -108,18 +110,33 @@ class ReadAvatar(NamedTuple, Generic[Content]):
     content: Content
 
 
+Tensors = dict[str, Tensor]
+
+
 def read_stored(
     folder: Path,
     name: str,
-    read_exact: Callable[[Path, HeadArrays], Content],
-    read_coded: Callable[[Path, HeadArrays], tuple[Subject, Content]],
+    content_of: Callable[[Path, Tensors, Mapping[str, str], HeadArrays], Content],
+    read_coded: Callable[[Path, HeadArrays], tuple[Subject, Tensors, Mapping[str, str]]],
 ) -> ReadAvatar[Content]:
-    """Read the coded file of a folder if there is one, else the file ``name`` and the subject written by training."""
+    """Read the coded file of a folder if there is one, else the file ``name`` and the subject written by training.
+
+    Parameters
+    ----------
+    content_of : Callable
+        Checks the tensors and the metadata of a file, and returns the content; its last argument is the head model.
+    read_coded : Callable
+        Subject, tensors and metadata of the coded file (`avatars.compact.layouts.read_coded`).
+
+    Raises `InputError` for damaged or incompatible files.
+    """
     head, coded = read_shared_head(folder), folder / COMPACT_FILE
     if coded.exists():
-        return ReadAvatar([coded], head, *read_coded(coded, head))
+        subject, tensors, metadata = read_coded(coded, head)
+        return ReadAvatar([coded], head, subject, content_of(coded, tensors, metadata, head))
     files = [folder / name, folder / SUBJECT_FILE]
-    return ReadAvatar(files, head, read_subject(files[1], head), read_exact(files[0], head))
+    content = content_of(files[0], *read_safetensors(files[0]), head)
+    return ReadAvatar(files, head, read_subject(files[1], head), content)
 
 
 def settings_text(config: Any, names: Sequence[str], optional: Sequence[str] = ()) -> str:

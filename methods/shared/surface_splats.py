@@ -29,7 +29,7 @@ from .rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from .schedule import Sampler
 from .subject_mesh import BoundedCache, SubjectMesh, TrainingPoses
 from .surface_points import MeshPoints, SurfacePoints, point_tensors, spread_points, take_points
-from .tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors, write_tensors
+from .tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, write_tensors
 
 Settings = TypeVar("Settings")
 Config = TypeVar("Config", bound=SurfaceSettings)
@@ -166,9 +166,10 @@ class SurfaceSplats(Generic[Settings]):
         write_tensors(path, self.tensors | point_tensors(self.points), {self.KEY: self.text()})
 
     @classmethod
-    def read(cls, path: Path, head: HeadAsset, device: str) -> Self:
-        """Read and check what `write` wrote. Raises `InputError` where a tensor is missing or does not fit."""
-        tensors, metadata = read_safetensors(path)
+    def of(
+        cls, path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str], head: HeadAsset, device: str
+    ) -> Self:
+        """Check the content of a file that `write` wrote. Raises `InputError` where a tensor is missing or does not fit."""
         settings = cls.settings_of(path, metadata.get(cls.KEY, ""))
         points = take_points(path, tensors, len(head.faces))
         return cls(tensors, points, settings).checked(path, head, device)
@@ -186,7 +187,7 @@ class SurfaceAvatar(StoredSplatAvatar, Generic[Stored]):
 
     stored_class: ClassVar[Any]
     read_coded: ClassVar[Any]
-    """Subject and content of a coded file, of its path, the head model and a device."""
+    """Reader of a coded file, see `read_stored`."""
 
     def __init__(self, files: Sequence[Path], head: HeadAsset, subject: Subject, stored: Stored, device: str):
         super().__init__(files, LastPose(self._posed), device)
@@ -197,8 +198,8 @@ class SurfaceAvatar(StoredSplatAvatar, Generic[Stored]):
     @classmethod
     def read(cls, folder: Path, device: str) -> Self:
         """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
-        readers = partial(cls.stored_class.read, device=device), partial(cls.read_coded, device=device)
-        return cls(*read_stored(folder, AVATAR_FILE, *readers), device)
+        content_of = partial(cls.stored_class.of, device=device)
+        return cls(*read_stored(folder, AVATAR_FILE, content_of, cls.read_coded), device)
 
     def _posed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
         arguments = self.mesh.arguments([pose])

@@ -106,7 +106,7 @@ class _Rasterize(torch.autograd.Function):
             _in_order(inputs),
             _arrays(grad_image.contiguous(), grad_alpha.contiguous()),
             _in_order(gradients),
-            (*_arrays(grad_viewmat, grad_K), None),
+            _arrays(grad_viewmat, grad_K),
             ctx.threads,
         )
         return (*gradients, grad_viewmat, grad_K, None, None, None, None)

@@ -27,7 +27,7 @@ from ..drawing import colour_map
 from ..papers import printed_tables
 from ..pareto.points import LATENCY, SIZE, SPEED, pareto_front
 from ..printed import as_printed
-from ..runs import FrameSelection, RunData, RunSet
+from ..runs import FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import COMPARISON, layouts, table_of
 from ..tables import AVATAR_TITLE, TITLES, Table
@@ -81,9 +81,8 @@ def write_report(settings: PageSettings, progress: Progress = no_progress) -> Co
         check_output_folder(out)
     else:
         check_writable(out, "--out")
-    read = tuple(RunData.read(Path(folder)) for folder in settings.runs)
-    runs = RunSet.joined(read)
-    page, pictures, files = page_text(runs, read, max_mb, settings, progress, apart=settings.split)
+    runs = RunSet.read([Path(folder) for folder in settings.runs])
+    page, pictures, files = page_text(runs, max_mb, settings, progress, apart=settings.split)
     if settings.split:
         write_pictures(out, files)
         write_text(out / INDEX, page)
@@ -104,14 +103,13 @@ def _size(page: str, files: Sequence[PictureFile]) -> int:
 
 def page_text(
     runs: RunSet,
-    read: tuple[RunData, ...],
     max_mb: float,
     settings: PageSettings,
     progress: Progress = no_progress,
     *,
     apart: bool = False,
 ) -> tuple[str, Pictures, list[PictureFile]]:
-    """The page of loaded runs (``read``), its images, and the files of images that are not embedded.
+    """The page of loaded runs, its images, and the files of images that are not embedded.
 
     Raises `InputError` if ``max_mb`` does not suffice.
     """

@@ -157,7 +157,7 @@ def test_a_table_is_aligned_text_on_a_terminal(
     assert ("<ins>" in printed) == pipes
 
 
-def test_a_benchmark_prints_a_table_or_json_and_decides_the_exit_code(capsys, tmp_path, monkeypatch):
+def test_a_benchmark_prints_a_table_or_json(capsys, tmp_path, monkeypatch):
     (tmp_path / "toy_benchmark.py").write_text(
         "from headbench.bench.specs import BenchmarkSpec, CommandResult\n"
         "def speed(quick, progress):\n"

@@ -37,7 +37,7 @@ def test_the_published_manifest_is_written_as_it_was_read(published, tmp_path):
         assert (tmp_path / "again" / file).read_bytes() == (published.parent / file).read_bytes()
 
 
-def test_protocols_that_are_missing_or_of_another_run_are_refused(published):
+def test_protocols_missing_or_of_another_run_are_refused(published):
     own = Manifest.read(published).protocols
     first, second = (protocol_path(published.parent, each.hash) for each in own.values())
     second.replace(first)

@@ -1,7 +1,5 @@
 """Stands in for the renderer of synthetic captures where a test needs pictures, but not how they look."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """The clip: lazy pixels, records, use from threads."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

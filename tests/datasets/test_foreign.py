@@ -17,12 +17,7 @@ CASES = {
     "an archive": (["me.tar.gz"], "me.tar.gz", "an archive", "Unpack it"),
     "an image": (["me.jpg"], "me.jpg", "an image", "VHAP"),
     "a head model": (["flame2023.pkl"], "flame2023.pkl", "a file", "--head"),
-    "a JSON of a capture": (
-        ["a/transforms_train.json"],
-        "a/transforms_train.json",
-        "its files",
-        "its folder",
-    ),
+    "a JSON of a capture": (["a/transforms_val.json"], "a/transforms_val.json", "its files", "its folder"),
     "nothing inside": ([".hidden"], "", "an empty folder", ""),
     "a folder of videos": (["a.mp4", "b.mp4"], "", "a folder of videos", "VHAP"),
     "a folder of images": (["a.png", "b.png", "notes.txt"], "", "a folder of images", "VHAP"),

@@ -1,7 +1,5 @@
 """The mesh rasteriser against ray casting, and its pictures against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
@@ -48,7 +46,7 @@ def cast_rays(vertices, faces, view):
     return face, depth, weights
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_fragments_equal_cast_rays(seed):
     rng = np.random.default_rng(seed)
     vertices = rng.uniform(-1, 1, size=(24, 3))

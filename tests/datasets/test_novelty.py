@@ -37,11 +37,8 @@ def test_noise_of_training_is_no_part_of_its_span(train):
     assert novelty(noisy, np.array([[0.0, 0, 0, 0.8, 0]])).outside > 0.95
 
 
-def test_half_of_the_timesteps_beyond_is_half(train):
+def test_shares_of_timesteps_and_of_training_that_never_moves(train):
     assert novelty(train, np.array([[0.5, 0, 0, 0, 0], [2.0, 0, 0, 0, 0]])).beyond == 0.5
-
-
-def test_training_that_never_moves_spans_nothing():
     still = np.zeros((9, 5))
     assert novelty(still, np.ones((2, 5))) == (1.0, 1.0)
     assert novelty(still, still[:2]) == (0.0, 0.0)

@@ -29,17 +29,15 @@ def test_settings_that_the_reader_lacks_are_refused(pristine_capture):
 
 
 @pytest.mark.parametrize(
-    ("fill", "found"),
-    [
-        (lambda folder: None, "an empty folder"),
-        (lambda folder: (folder / "a.mp4").touch(), "a folder of videos"),
-        (lambda folder: folder.rmdir(), "no such file or folder"),
-    ],
+    ("data", "found"),
+    [("", "an empty folder"), ("a.mp4", "a folder of videos"), (None, "no such file or folder")],
 )
-def test_what_is_no_capture_is_described(tmp_path, fill, found):
+def test_what_is_no_capture_is_described(tmp_path, data, found):
     folder = tmp_path / "data"
-    folder.mkdir()
-    fill(folder)
+    if data is not None:
+        folder.mkdir()
+    if data:
+        (folder / data).touch()
     with pytest.raises(InputError, match=rf"a reader knows .*colmap.*{found}"):
         open_clip(folder)
 
@@ -86,10 +84,7 @@ def test_a_clip_of_another_reader_passes_through_steps(plain_folder, pristine_ca
     [
         (lambda clip: {"shape": clip.shape[:-1]}, "shape"),
         (lambda clip: {"static_offset": clip.static_offset[:-1]}, "static_offset"),
-        (
-            lambda clip: {"poses": {t: replace(p, expression=np.zeros(1)) for t, p in clip.poses.items()}},
-            "expression",
-        ),
+        (lambda c: {"poses": {t: replace(p, expression=[0.0]) for t, p in c.poses.items()}}, "expression"),
     ],
 )
 def test_a_clip_of_another_head_model_is_refused(plain_folder, change, key):
@@ -102,13 +97,9 @@ def test_a_clip_of_another_head_model_is_refused(plain_folder, change, key):
 
 def test_a_clip_of_another_reader_is_adapted_to_methods(plain_folder, pristine_capture, tmp_path):
     needs = MethodNeeds(monocular=True, resolution=ResolutionRule(divide=2))
-    adapted = [
-        adapter()(clip, needs, {})(tmp_path, no_progress)
-        for clip in (
-            open_clip(plain_folder, "plain_reader:SPEC").source,
-            read_capture(pristine_capture.union),
-        )
-    ]
-    key = read_capture(pristine_capture.union).splits["novel_view"][0]
+    same = read_capture(pristine_capture.union)
+    clips = open_clip(plain_folder, "plain_reader:SPEC").source, same
+    adapted = [adapter()(clip, needs, {})(tmp_path, no_progress) for clip in clips]
+    key = same.splits["novel_view"][0]
     images = [one.clip.image(one.key(key)) for one in adapted]
     np.testing.assert_array_equal(*images)

@@ -1,7 +1,5 @@
 """A tiny capture on disk for tests: a toy head, flat-shaded by its silhouette, written by our writer."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

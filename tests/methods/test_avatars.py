@@ -204,7 +204,7 @@ def test_ga_harmonics_are_stored_channel_by_channel(clip, tmp_path):
     found, faces = read_ga_splats(path, 4, "cpu")
     assert torch.equal(faces, binding)
     assert all(torch.equal(found[name], splats[name]) for name in splats)
-    with pytest.raises(InputError, match="binding_0"):
+    with pytest.raises(InputError, match="binding"):
         read_ga_splats(path, 3, "cpu")
 
 

@@ -1,12 +1,6 @@
 """A run killed anywhere and continued ends with the same avatar, bit for bit."""
 
-import os
-import signal
-import subprocess
-import sys
-import time
 from functools import cache
-from pathlib import Path
 
 import pytest
 
@@ -28,13 +22,11 @@ from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.loop import CHECKPOINT
 from headbench.methods.shared.optimisation import Optimiser
 
-from ..datasets.head.toy import toy_head
 from .flashavatar.small import SMALL as SMALL_FLASHAVATAR
 from .gha.small import small_config
 from .insta.small import SMALL as SMALL_INSTA
 from .ours.toy import REPAIRED, changed
 from .rgbavatar.small import SMALL as SMALL_RGBAVATAR
-from .toy_clip import toy_clip
 
 # Rounds at 8, 16, ..., 32, resets at 10, 30; lines from iteration 4 on.
 SPLATS = SplatTraining(
@@ -142,30 +134,3 @@ def test_the_comparison_would_notice_a_lost_moment(unbroken, clip, tmp_path, mon
     with pytest.raises(Killed):
         fit(name, clip, tmp_path, killing(20))
     assert content(fit(name, clip, tmp_path)) != expected
-
-
-def _child(name, folder):
-    """Train as a process of its own; `test_a_process_killed_outright` kills it."""
-    clip = toy_clip(toy_head(16), timesteps=3, cameras=3, width=28, height=36)
-    fit(name, clip, Path(folder), lambda done, total, note="": time.sleep(0.05))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("after_s", [0.0, 0.4, 1.1])
-def test_a_process_killed_outright(unbroken, clip, tmp_path, after_s):
-    name, expected = unbroken
-    root = Path(__file__).parents[2]
-    code = (
-        "import importlib, sys; sys.path.insert(0, sys.argv[1])\n"
-        "importlib.import_module('tests.methods.test_resume')._child(sys.argv[2], sys.argv[3])"
-    )
-    child = subprocess.Popen([sys.executable, "-c", code, str(root), name, str(tmp_path)])
-    deadline = time.monotonic() + 120
-    while not (tmp_path / CHECKPOINT).exists():
-        assert child.poll() is None, "the child ended before its first checkpoint"
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    time.sleep(after_s)
-    os.kill(child.pid, signal.SIGKILL)
-    assert child.wait() == -signal.SIGKILL
-    assert content(fit(name, clip, tmp_path)) == expected

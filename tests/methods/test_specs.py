@@ -156,7 +156,18 @@ def test_the_paper_preset_of_gbs_is_the_paper():
         (SplatTraining, {"max_splats": 0}),
         (SplatTraining, {"final_rate": 0.0}),
         (SplatTraining, {"scale_lr": -1e-3}),
+        *(
+            (RGBAvatarConfig, {"color_weight": -1.0, **more})
+            for more in ({}, {"color_init_variant": "official"})
+        ),
+        *((RGBAvatarConfig, {"inputs": inputs}) for inputs in ((), ("smile",))),
+        (RGBAvatarConfig, {"batch": 151, "online": True}),
         (RGBAvatarConfig, {"position_share": -1.0}),
+        (RGBAvatarConfig, {"samples": 0}),
+        (RGBAvatarConfig, {"batch": 0}),
+        (RGBAvatarConfig, {"initial_scale_mm": 0.0}),
+        (RGBAvatarConfig, {"position_lr_final": 0.0}),
+        (RGBAvatarConfig, {"frame_variant": "official", "uv_chart": False}),
         (FlashAvatarConfig, {"samples": 0}),
         (FlashAvatarConfig, {"final_rate": 0.0}),
         (FlashAvatarConfig, {"frequencies": 17}),

@@ -130,7 +130,10 @@ def make_run(toy, tmp_path, made_runs):
             made[key] = place / str(len(made)) / "run"
             run_on(made[key].with_name(data), made[key], *methods, subjects=subjects, **settings | changes)
         shutil.copytree(made[key].with_name(data), tmp_path / data, dirs_exist_ok=True)
-        return Path(shutil.copytree(made[key], tmp_path / name))
+        run = RunFolder(Path(shutil.copytree(made[key], tmp_path / name)))
+        text = run.manifest.read_text().replace(str(made[key]), str(run.root))
+        run.manifest.write_text(text.replace(str(made[key].parent), str(tmp_path)))
+        return run.root
 
     return make
 

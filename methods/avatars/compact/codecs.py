@@ -1,175 +1,251 @@
-"""Codec for avatars of all native methods: stored tensors of each, and their visibility in training views.
+"""Encoding of avatars of all native methods: the tensors of each, and their visibility in training views.
 
-All methods share the container, the entropy coder, the transform and the steps (`Precision`); they differ only in their
-parts.
+All methods share the file, the coder and the steps (`Precision`); they differ only in their layouts.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
 
-from ....bench.contracts import Avatar, Clip, FloatArray, HeadAsset, HeadPose, SplatAvatar
+from ....bench.contracts import Avatar, Clip, FloatArray, HeadAsset, SplatAvatar
 from ....bench.errors import InputError
-from ....bench.io.arrays import Member, read_arrays
-from ....bench.io.files import digest, read_bytes
+from ....bench.io.arrays import read_npz
+from ....bench.io.documents import read_json
+from ....bench.io.files import digest
+from ...flashavatar.hyper_gaussians import gaussian_shapes
 from ...flashavatar.method import FlashAvatarAvatar
 from ...ga.method import GAAvatar
 from ...gbs.avatar import GBSAvatar
-from ...gha.avatar import CONFIG, OF_CODE, TABLE, GHAAvatar
-from ...insta.avatar import FIELD_FILE as INSTA_FILE
-from ...insta.avatar import OCCUPIED, SETTINGS, SETTINGS_FILE, InstaAvatar, read_settings
-from ...insta.avatar import TABLE as GRID
-from ...insta.field import Architecture
+from ...gbs.storage import EXPRESSIONS
+from ...gha.avatar import CONFIG, TABLE, GHAAvatar
+from ...gha.gaussian_head import POINTS
+from ...insta.avatar import FIELD_FILE, SETTINGS, SETTINGS_FILE, InstaAvatar
+from ...ops.harmonics import sh_basis, sh_degree
 from ...ours.avatar import OursAvatar
+from ...ours.storage import DYNAMIC, PER_SPLAT, splat_columns
 from ...rgbavatar.method import RGBAvatarAvatar
-from ...rgbavatar.model import blend_weights
-from ...shared.avatar_files import AVATAR_FILE, COMPACT_FILE, SUBJECT_FILE, read_subject, save_shared_head
+from ...rgbavatar.model import SHAPES, blend_weights
+from ...shared.avatar_files import (
+    AVATAR_FILE,
+    COMPACT_FILE,
+    SUBJECT_FILE,
+    Subject,
+    read_subject,
+    save_shared_head,
+)
 from ...shared.capacity import training_poses
 from ...shared.networks import tracked_inputs
+from ...shared.surface_points import point_tensors
+from ...shared.surface_splats import SurfaceAvatar
 from ...shared.tensor_files import read_safetensors
 from ..views import importance, training_views
-from .blended import encode_blended
-from .bound import encode_bound
+from .coder import Coder, CoderInput, visibility_classes
 from .container import CODEC, Content, write_content
-from .file import encode
-from .networks import encode_networks
-from .offsets import encode_offsets
+from .field import field, field_metrics
+from .layouts import COLOURS, Layout, blended, bound, code_subject, grid, networks, offsets, reduced
 from .precision import Precision
-from .reduced import encode_reduced
-from .simplify import simplify
 
-CODEC_VERSION = 3
+CODEC_VERSION = 4
 """Codec version, increased when the same avatar and steps give different files."""
 DRIVING_FILE = "driving.npz"
 """Driving signal beside the avatars of some methods, which is not part of their size."""
 
 
-def encode_avatar(avatar: Avatar, head: HeadAsset, precision: Precision, clip: Clip | None = None) -> Content:
-    """Content of the coded file of an avatar of any method of `ENCODERS`.
+class Parts(NamedTuple):
+    """An avatar to encode: layout, source, subject and texts; splats in any order."""
 
-    With a clip, steps follow the visibility of each splat in its training views, and parts invisible in all training poses
-    are left out.
-    Raises `InputError` for an avatar of another method, and for one that was read from a coded file.
+    layout: Layout
+    source: CoderInput
+    subject: Subject
+    text: Mapping[str, str] = {}
+
+
+def parts_of(avatar: Avatar, head: HeadAsset, clip: Clip | None) -> Parts:
+    """What `write_coded` encodes. With a clip, steps follow the visibility of each splat in its training views.
+
+    Raises `InputError` for an avatar of a method that has no codec, and for one that was read from a coded file.
     """
-    encoder = ENCODERS.get(type(avatar))
-    if encoder is None:
-        methods = "ours, ga, gbs, gha, insta, rgbavatar or flashavatar"
-        raise InputError("avatar", "", f"one of {methods}", f"a {type(avatar).__name__}")
-    if any(path.name == COMPACT_FILE for path in avatar.files()):
-        raise InputError(avatar.files()[0], "", "the files of a training", "a coded avatar")
-    content = encoder(avatar, head, precision, clip)
-    return replace(content, text={**content.text, CODEC: codec_name(precision)})
-
-
-def codec_name(precision: Precision) -> str:
-    """Name of the codec with its steps: "2, steps x1", and a digest of the individual steps if they are not the defaults."""
-    name = f"{CODEC_VERSION}, steps x{precision.step:g}"
-    own = replace(precision, step=1.0)
-    return name if own == Precision() else f"{name} ({digest(asdict(own))[:8]})"
+    encoder, files = ENCODERS.get(type(avatar)), [*avatar.files()]
+    if encoder is None or any(path.name == COMPACT_FILE for path in files):
+        found = "a coded one" if encoder else f"a {type(avatar).__name__}"
+        raise InputError(files[0], "", "a trained avatar of a native method that has a codec", found)
+    return encoder(avatar, head, clip)
 
 
 def write_coded(
-    avatar: Avatar, head: HeadAsset, out: Path, precision: Precision, clip: Clip | None, driving: Path | None
-) -> Content:
-    """Write the coded avatar, its head model and, if there is one, the file of its ``driving`` signal into a folder."""
-    content = encode_avatar(avatar, head, precision, clip)
+    parts: Parts, head: HeadAsset, out: Path, precision: Precision, driving: Path | None
+) -> dict[str, int]:
+    """Write a coded avatar, its head model and, if there is one, the file of its ``driving`` signal into a folder.
+
+    Returns the bytes of each part of `Precision`.
+    """
+    layout, source, subject, own = parts
+    person = {"shape": subject.shape, "static_offset": subject.static_offset}
+    # A digest names individual steps that are not the defaults.
+    digest_of = "" if precision.parts == Precision().parts else f" ({digest(precision.parts)[:8]})"
+    codec = f"{CODEC_VERSION}, steps x{precision.step:g}{digest_of}"
+    text = {"name": subject.name, "head_model": subject.head_model, **own, CODEC: codec}
+    coder = Coder(precision.scaled, text, replace(source, tensors={**source.tensors, **person}))
+    layout(coder, head, code_subject(coder, head))
+    assert not coder.left
     save_shared_head(out, head)
     if driving is not None and driving.is_file():
         shutil.copyfile(driving, out / DRIVING_FILE)
-    write_content(out / COMPACT_FILE, content)
-    return content
+    sizes: dict[str, int] = {}
+    written = write_content(out / COMPACT_FILE, Content(coder.arrays, text, precision.scaled.parts))
+    for name, size in written.items():
+        sizes[coder.parts[name]] = sizes.get(coder.parts[name], 0) + size
+    return sizes
 
 
-def weights_of(avatar: SplatAvatar, clip: Clip | None) -> FloatArray | None:
-    """(N,) importance of the splats in the training views of a clip, None without one."""
-    return None if clip is None else importance(avatar, training_views(clip))
+class _Splats:
+    """Splats of an avatar in the order of the file: by class of visibility, since the values of a class are of similar range, and
+    by triangle. ``rows`` are their indices."""
+
+    def __init__(self, avatar: SplatAvatar, clip: Clip | None, triangles: np.ndarray):
+        weights = None if clip is None else importance(avatar, training_views(clip))
+        classes = visibility_classes(weights, len(triangles))
+        self.rows = np.lexsort((triangles, classes))
+        self._classes = classes[self.rows]
+        self._weights = None if weights is None else weights[self.rows]
+
+    def source(
+        self, splats: Mapping[str, Any], others: Mapping[str, Any], metrics: Mapping[str, FloatArray]
+    ) -> CoderInput:
+        """Input of the coder, of arrays or tensors with a row for each splat, and of others. Harmonics are joined."""
+        arrays = {name: _numpy(value)[self.rows] for name, value in splats.items()}
+        if "sh_dc" in arrays:
+            dc, rest = arrays.pop("sh_dc"), arrays.pop("sh_rest")
+            arrays[COLOURS] = np.concatenate([dc[:, :, None], rest], axis=2).reshape(len(dc), -1)
+        arrays |= {name: _numpy(value) for name, value in others.items()} | {"classes": self._classes}
+        return CoderInput(arrays, self._weights, metrics)
 
 
-def _encode_ours(avatar: OursAvatar, head: HeadAsset, precision: Precision, clip: Clip | None) -> Content:
-    poses: list[HeadPose] = [] if clip is None else training_poses(clip)
-    field = simplify(avatar, poses, precision.scaled)
-    simplified = OursAvatar([], avatar.mesh, avatar.subject, field, "cpu")
-    return encode(field, avatar.subject, head, precision, weights_of(simplified, clip))
+def _numpy(values: Tensor | np.ndarray) -> np.ndarray:
+    return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
 
 
-def _encode_ga(avatar: GAAvatar, head: HeadAsset, precision: Precision, clip: Clip | None) -> Content:
-    directions = None
+def _ours(avatar: OursAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
+    others = dict(avatar.field.tensors)
+    splats = splat_columns(others.pop("splats"))
+    splats |= {name: splats[name][:, 0] for name in ("opacities", "binding")}
+    if "rotation" not in avatar.field.dynamic:  # which is added to quaternions of any length
+        splats["quats"] = normalize(splats["quats"], dim=1)
+    splats |= {name: others.pop(name) for name in PER_SPLAT if name in others}
+    order = _Splats(avatar, clip, _numpy(splats["binding"]))
+    source = order.source(splats, others, field_metrics(avatar.field.tensors))
+    return Parts(field, source, avatar.subject, {DYNAMIC: ",".join(avatar.field.dynamic)})
+
+
+def _ga(avatar: GAAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
+    metrics = {}
     if clip is not None:
-        # The harmonics are in world space, where the cameras are static.
+        # Harmonics stay in the world. Errors count mostly along the directions from which static cameras see them in training;
+        # a fifth of the weight is that of all directions, for other views.
         views = training_views(clip)
         middle = np.mean(avatar.splats(views[0][1]).means, axis=0)
-        places = {camera.id: camera.center for camera, _ in views}
-        directions = np.stack([middle - place for place in places.values()])
-        directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    splats = {name: value.cpu() for name, value in avatar.splat_tensors.items()}
-    weights = weights_of(avatar, clip)
-    return encode_bound(splats, avatar.binding.cpu(), avatar.subject, precision, weights, directions)
+        centers = {camera.id: camera.center for camera, _ in views}
+        away = middle - np.stack([*centers.values()])
+        away = away / np.linalg.norm(away, axis=1, keepdims=True)
+        basis = sh_basis(torch.from_numpy(away), sh_degree(avatar.splat_tensors["sh_rest"])).numpy()
+        metric = 0.2 * np.eye(basis.shape[1]) + 0.8 * 4 * np.pi * basis.T @ basis / len(basis)
+        metrics[COLOURS] = np.kron(np.eye(3), metric)
+    splats = {**avatar.splat_tensors, "binding": avatar.binding}
+    splats["quats"] = normalize(splats["quats"], dim=1)
+    source = _Splats(avatar, clip, _numpy(avatar.binding)).source(splats, {}, metrics)
+    return Parts(bound, source, avatar.subject)
 
 
-def _encode_gbs(avatar: GBSAvatar, head: HeadAsset, precision: Precision, clip: Clip | None) -> Content:
-    coefficients = None
+def _gbs(avatar: GBSAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
+    stored, coefficients = avatar.stored, np.ones(avatar.stored.expressions)
     if clip is not None:
         expressions = np.stack([pose.expression for pose in training_poses(clip)]).astype(np.float64)
-        coefficients = np.sqrt((expressions**2).mean(0))
-    weights = weights_of(avatar, clip)
-    return encode_blended(avatar.stored, avatar.subject, head, precision, weights, coefficients)
+        coefficients = np.sqrt((expressions**2).mean(0))[: stored.expressions]
+    coefficients = np.maximum(coefficients, 1e-3 * max(float(np.max(coefficients, initial=0)), 1e-9))
+    owners, moving = _numpy(stored.entries.owners), _numpy(stored.entries.expressions)
+    moved_by = np.zeros((len(stored.points.triangles), stored.expressions), np.int64)
+    moved_by[owners, moving] = 1
+    order = _Splats(avatar, clip, stored.points.triangles)
+    # Rows of the differences follow the order of the splats.
+    rows = np.lexsort((moving, np.argsort(order.rows)[owners]))
+    splats = {**stored.neutral, **point_tensors(stored.points), "moved_by": moved_by}
+    others = {"differences": _numpy(stored.differences)[rows], "coefficients": coefficients}
+    text = {EXPRESSIONS: str(stored.expressions)}
+    return Parts(blended, order.source(splats, others, {}), avatar.subject, text)
 
 
-def _encode_gha(avatar: GHAAvatar, head: HeadAsset, precision: Precision, clip: Clip | None) -> Content:
-    path = _exact(avatar, AVATAR_FILE)
-    tensors, metadata = read_safetensors(path)
-    arrays = {name: value.numpy() for name, value in tensors.items()}
-    exact = ("landmarks", "origin", "center", "background", *OF_CODE)
-    options: dict[str, Any] = {"text": {CONFIG: metadata[CONFIG]}, "weights": weights_of(avatar, clip)}
-    return encode_networks(arrays, avatar.subject, precision, splats=TABLE, exact=exact, **options)
+def _gha(avatar: GHAAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
+    path = next(path for path in avatar.files() if path.name == AVATAR_FILE)
+    others, metadata = read_safetensors(path)
+    columns = others.pop(TABLE).numpy()
+    splats = dict(zip((*POINTS, "features"), np.split(columns, np.cumsum([*POINTS.values()]), axis=1)))
+    splats["opacities"] = splats["opacities"][:, 0]
+    metrics = {"features": np.diag(np.maximum(splats["features"].std(0, np.float64), 1e-6) ** -2)}
+    source = _Splats(avatar, clip, np.zeros(len(columns))).source(splats, others, metrics)
+    return Parts(networks, source, avatar.subject, {CONFIG: metadata[CONFIG]})
 
 
-def _encode_insta(avatar: InstaAvatar, head: HeadAsset, precision: Precision, clip: Clip | None) -> Content:
-    path = _exact(avatar, INSTA_FILE)
-    config = read_settings(path.parent / SETTINGS_FILE)
-    shapes = Architecture.of(config, head.expression_basis.shape[2]).shapes()
-    members = {name: Member("f", shape, dtype="f2") for name, shape in shapes.items()}
-    arrays = read_arrays(path, {**members, OCCUPIED: Member("u", ("bytes",), dtype="u1")})
-    subject = read_subject(path.parent / SUBJECT_FILE, head)
-    text = {SETTINGS: read_bytes(path.parent / SETTINGS_FILE, "settings").decode()}
-    return encode_networks(arrays, subject, precision, grid=GRID, text=text)
+def _insta(avatar: InstaAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
+    folder = avatar.files()[0].parent  # the files that the avatar was read from
+    arrays, text = read_npz(folder / FIELD_FILE), {SETTINGS: json.dumps(read_json(folder / SETTINGS_FILE))}
+    arrays["spread"] = np.maximum(arrays["table"].std(dtype=np.float64), 1e-9).reshape(1)
+    return Parts(grid, CoderInput(arrays), read_subject(folder / SUBJECT_FILE, head), text)
 
 
-def _encode_rgbavatar(
-    avatar: RGBAvatarAvatar, head: HeadAsset, precision: Precision, clip: Clip | None
-) -> Content:
-    moments = None
-    if clip is not None:
-        inputs = tracked_inputs(avatar.mesh.arguments(training_poses(clip)), avatar.stored.settings.inputs)
-        found = blend_weights(avatar.stored.tensors, inputs).double().cpu().numpy()
-        moments = found.T @ found / len(found)
-    return encode_reduced(avatar.stored, avatar.subject, head, precision, weights_of(avatar, clip), moments)
+def _rgbavatar(avatar: RGBAvatarAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
+    stored, metrics = avatar.stored, {}
+    if clip is not None:  # the second moments of the blendshapes' weights in training
+        inputs = tracked_inputs(avatar.mesh.arguments(training_poses(clip)), stored.settings.inputs)
+        found = blend_weights(stored.tensors, inputs).double().cpu().numpy()
+        metrics["shapes"] = np.kron(found.T @ found / len(found), np.eye(10))
+    shapes = torch.cat([stored.tensors[name] for name in SHAPES.values()], dim=2)  # (K, N, 10)
+    tensors = {name: value for name, value in stored.tensors.items() if name not in SHAPES.values()}
+    return _surface(
+        reduced, avatar, head, clip, tensors | {"shapes": shapes.transpose(0, 1).flatten(1)}, metrics
+    )
 
 
-def _encode_flashavatar(
-    avatar: FlashAvatarAvatar, head: HeadAsset, precision: Precision, clip: Clip | None
-) -> Content:
-    return encode_offsets(avatar.stored, avatar.subject, precision, weights_of(avatar, clip))
+def _flashavatar(avatar: FlashAvatarAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
+    tensors, metrics = avatar.stored.tensors, {}
+    for name in filter(tensors.__contains__, gaussian_shapes(1)):
+        metrics[name] = np.diag(np.abs(_numpy(tensors[name])).max(0, initial=1e-6) ** -2.0)
+    return _surface(offsets, avatar, head, clip, tensors, metrics)
 
 
-def _exact(avatar: Avatar, name: str) -> Path:
-    return next(path for path in avatar.files() if path.name == name)
+def _surface(
+    layout: Layout,
+    avatar: SurfaceAvatar[Any],
+    head: HeadAsset,
+    clip: Clip | None,
+    tensors: Mapping[str, Tensor],
+    metrics: Mapping[str, FloatArray],
+) -> Parts:
+    """Parts of splats on a surface; ``shapes`` has a row for each splat, too."""
+    stored = avatar.stored
+    own = {"shapes", *(name for name, shape in stored.shapes(head).items() if shape[0] == "N")}
+    splats = {name: value for name, value in tensors.items() if name in own} | point_tensors(stored.points)
+    others = {name: value for name, value in tensors.items() if name not in own}
+    source = _Splats(avatar, clip, stored.points.triangles).source(splats, others, metrics)
+    return Parts(layout, source, avatar.subject, {stored.KEY: stored.text()})
 
 
-Encoder = Callable[[Any, HeadAsset, Precision, Clip | None], Content]
-ENCODERS: Mapping[type, Encoder] = {
-    OursAvatar: _encode_ours,
-    GAAvatar: _encode_ga,
-    GBSAvatar: _encode_gbs,
-    GHAAvatar: _encode_gha,
-    InstaAvatar: _encode_insta,
-    RGBAvatarAvatar: _encode_rgbavatar,
-    FlashAvatarAvatar: _encode_flashavatar,
+ENCODERS: Mapping[type, Callable[[Any, HeadAsset, Clip | None], Parts]] = {
+    OursAvatar: _ours,
+    GAAvatar: _ga,
+    GBSAvatar: _gbs,
+    GHAAvatar: _gha,
+    InstaAvatar: _insta,
+    RGBAvatarAvatar: _rgbavatar,
+    FlashAvatarAvatar: _flashavatar,
 }
-"""How the avatars of each method are encoded; each method reads its own coded file."""
+"""Arrays of the avatars of each method."""

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ....bench.contracts import Avatar, ByteArray, Clip, HeadAsset, Progress, SplatAvatar, no_progress
+from ....bench.contracts import Avatar, ByteArray, Clip, Progress, SplatAvatar, no_progress
 from ....bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
-from ....bench.engine.stored import StoredAvatar, avatar_digest, open_avatar, write_avatar_record
+from ....bench.engine.stored import avatar_digest, open_avatar, write_avatar_record
 from ....bench.errors import InputError
 from ....bench.io.images import quantise
 from ....bench.protocol import evenly_with_ends
@@ -21,12 +21,14 @@ from ....bench.specs import CommandResult
 from ...shared.avatar_files import COMPACT_FILE, read_shared_head
 from ...shared.losses import picture_ssim, psnr, squared_error
 from ..export import neutral_pose
-from .codecs import DRIVING_FILE, ENCODERS, write_coded
-from .file import part_sizes
-from .precision import EXACT, Precision
+from .codecs import DRIVING_FILE, parts_of, write_coded
+from .precision import EXACT
 from .settings import CompactSettings
 
-SIMPLIFIED, WHOLE = "left out", "all"
+Quality = dict[str, float | None]
+"""PSNR (dB) and SSIM against the ground truth, means over frames, None without one; and ``psnr_exact``, dB against the renders
+of the exact avatar, from the mean squared error over all frames, None if they are equal."""
+WHOLE = "all"
 
 
 def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) -> CommandResult:
@@ -35,161 +37,71 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
     Raises `InputError` for a folder without the files of a training, and for the capture of another subject.
     """
     stored, out = open_avatar(Path(settings.avatar)), Path(settings.out)
-    folder = stored.folder
-    exact = stored.load()
-    if type(exact) not in ENCODERS or any(path.name == COMPACT_FILE for path in exact.files()):
-        found = f"an avatar of {stored.record['method']}"
-        raise InputError(folder, "", "the files of a trained avatar of a native method", found)
-    head = read_shared_head(folder)
+    folder, exact = stored.folder, stored.load()
+    head, driving = read_shared_head(folder), folder / DRIVING_FILE
     with TemporaryDirectory() as scratch:
         form = None
         if settings.compare is not None:
-            clip = settings.open(settings.compare, progress)
-            if clip.subject != stored.record["subject"]:
-                raise InputError(
-                    settings.compare, "subject", repr(stored.record["subject"]), repr(clip.subject)
-                )
-            needs = MethodNeeds.of(stored.method.spec)
+            clip, subject = settings.open(settings.compare, progress), stored.record["subject"]
+            if clip.subject != subject:
+                raise InputError(settings.compare, "subject", repr(subject), repr(clip.subject))
+            needs, kept = MethodNeeds.of(stored.method.spec), Path(scratch) / "adapted"
             step = plan(clip, needs, stored.heads)
-            kept = Path(scratch) / "adapted"
             form = AdaptedClip(clip) if step is None else apply(step, needs, kept, f"adapting {clip.subject}")
             comparison = Comparison(clip, form, exact, settings.frames, settings.scale)
         own = None if form is None else form.clip
-        content = write_coded(exact, head, out, settings.precision, own, folder / DRIVING_FILE)
-        record = stored.record
+        prepared = parts_of(exact, head, own)
+        parts = write_coded(prepared, head, out, settings.precision, driving)
         source = {"of": avatar_digest(folder), "precision": asdict(settings.precision)}
-        shown = record["subject"], record["shape"], record["head_model"]
-        write_avatar_record(out, stored.method, *shown, "compact", source)
-        whole = {
-            "exact_bytes": sum(path.stat().st_size for path in exact.files()),
-            "compact_bytes": (out / COMPACT_FILE).stat().st_size,
-        }
-        parts = part_sizes(content)
+        record = stored.record
+        identity = record["subject"], record["shape"], record["head_model"]
+        write_avatar_record(out, stored.method, *identity, "compact", source)
+        size = sum(path.stat().st_size for path in exact.files())
         data: dict[str, Any] = {"file": out / COMPACT_FILE, "precision": settings.precision}
         if isinstance(exact, SplatAvatar):
-            data["splats"] = _splats(exact, head)
-            data["splats_kept"] = _splats(_read(stored, out), head)
-        data |= {"whole": whole, "parts": {part: {"compact_bytes": size} for part, size in parts.items()}}
+            data["splats"] = len(exact.splats(neutral_pose(head)).means)
+        data["whole"] = {"exact_bytes": size, "compact_bytes": (out / COMPACT_FILE).stat().st_size}
+        data["parts"] = {part: {"compact_bytes": size} for part, size in parts.items()}
         if own is not None:
-            precision = settings.precision.scaled
-
-            def read_as(variant: Precision) -> Avatar:
-                """The avatar read back from a file of these steps."""
-                write_coded(exact, head, Path(scratch) / "coded", variant, own, folder / DRIVING_FILE)
-                return _read(stored, Path(scratch) / "coded")
-
-            names = [part for part in precision.parts if part in parts]
-            costs = _costs(names, precision, read_as, comparison, progress)
-            data |= {"frames": len(comparison.keys), "exact": _plain(comparison.exact), "quality": costs}
+            steps = {name: step for name, step in settings.precision.scaled.parts.items() if name in parts}
+            variants = {name: replace(EXACT, **{name: step}) for name, step in steps.items()}
+            quality = {}
+            for done, (name, variant) in enumerate([*variants.items(), (WHOLE, settings.precision)]):
+                progress(done, len(variants) + 1, name)
+                write_coded(prepared, head, Path(scratch) / "coded", variant, driving)
+                coded: Avatar = stored.method.create().load(Path(scratch) / "coded", device="cpu")
+                quality[name] = comparison(coded)
+            data |= {"frames": len(comparison.keys), "exact": comparison.exact, "quality": quality}
     return CommandResult(_text(data), data)
 
 
-def _read(stored: StoredAvatar, folder: Path) -> Avatar:
-    avatar: Avatar = stored.method.create().load(folder, device="cpu")
-    return avatar
-
-
-def _splats(avatar: Avatar, head: HeadAsset) -> int:
-    assert isinstance(avatar, SplatAvatar)
-    return len(avatar.splats(neutral_pose(head)).means)
-
-
-def _costs(
-    names: Sequence[str],
-    precision: Precision,
-    read_as: Callable[[Precision], Avatar],
-    comparison: Comparison,
-    progress: Progress,
-) -> dict[str, dict[str, float | None]]:
-    """Quality with each part rounded alone, with all parts rounded, and with invisible splats removed only."""
-    variants = {name: replace(EXACT, **{name: getattr(precision, name)}) for name in names}
-    variants |= {SIMPLIFIED: EXACT, WHOLE: precision}
-    result = {}
-    for done, (name, variant) in enumerate(variants.items()):
-        progress(done, len(variants), name)
-        result[name] = _plain(comparison(read_as(variant)))
-    return result
-
-
-def _plain(quality: Quality) -> dict[str, float | None]:
-    """The value for JSON: None if it is not a number or infinite."""
-    return {name: value if math.isfinite(value) else None for name, value in quality._asdict().items()}
-
-
 def _text(data: Mapping[str, Any]) -> str:
-    qualities, exact = data.get("quality", {}), data.get("exact")
-    head = f"{'part':<12}{'exact':>12}{'coded':>12}"
-    if exact:
-        head += f"{'dB to truth':>14}{'SSIM to truth':>15}{'dB to exact':>13}"
-    rows = [head]
-    for part, sizes in data["parts"].items():
-        rows.append(_row(part, sizes, qualities.get(part), exact))
-    if exact:
-        rows.append(_row(SIMPLIFIED, {}, qualities[SIMPLIFIED], exact))
-    rows.append(_row(WHOLE, data["whole"], qualities.get(WHOLE), exact))
-    whole = data["whole"]
+    exact, whole = data.get("exact"), data["whole"]
+    columns = f"{'dB to truth':>14}{'SSIM to truth':>15}{'dB to exact':>13}" if exact else ""
+    rows = [f"{'part':<12}{'bytes':>12}{columns}"]
+    for part, sizes in {**data["parts"], WHOLE: whole}.items():
+        rows.append(f"{part:<12}{sizes['compact_bytes']:>12,}")
+        quality = data.get("quality", {}).get(part)
+        if exact and quality:
+            for name, width, digits in (("psnr", 14, 3), ("ssim", 15, 5)):
+                change = "" if exact[name] is None else f"{quality[name] - exact[name]:+.{digits}f}"
+                rows[-1] += f"{change:>{width}}"
+            to_exact = quality["psnr_exact"]
+            rows[-1] += f"{'equal' if to_exact is None else f'{to_exact:.2f}':>13}"
     ratio = whole["exact_bytes"] / whole["compact_bytes"]
-    line = f"{data['file']}: {whole['compact_bytes'] / 1e6:.3f} MB, 1/{ratio:.1f} of the exact files"
-    if "splats" in data:
-        count = data["splats"]
-        each = whole["compact_bytes"] / max(count, 1)
-        line += f"; {data['splats_kept']} of {count} splats kept, {each:.1f} bytes for each trained one"
-    rows.append(line)
+    rows.append(f"{data['file']}: {whole['compact_bytes'] / 1e6:.3f} MB, 1/{ratio:.1f} of the exact files")
+    if count := data.get("splats"):
+        rows[-1] += f"; {count} splats, {whole['compact_bytes'] / count:.1f} bytes for each"
     if exact:
         rows.append(
-            f"Quality on {data['frames']} held-out frames with only one part quantised. Left out: splats that no "
-            "training pose shows are removed, nothing is quantised."
+            f"Quality on {data['frames']} held-out frames with only one part quantised, less that of the exact avatar."
         )
-        if exact["psnr"] is not None:
-            rows.append(
-                f"Exact avatar: {exact['psnr']:.3f} dB, SSIM {exact['ssim']:.5f}; the table has differences from it."
-            )
     return "\n".join(rows)
 
 
-def _row(
-    part: str,
-    sizes: Mapping[str, int],
-    quality: Mapping[str, float | None] | None,
-    exact: Mapping[str, float | None] | None,
-) -> str:
-    row = f"{part:<12}"
-    for name in ("exact_bytes", "compact_bytes"):
-        row += f"{sizes[name]:>12,}" if name in sizes else f"{'':>12}"
-    if quality is None or exact is None:
-        return row.rstrip()
-    against = [f"{'':>14}", f"{'':>15}"]
-    if quality["psnr"] is not None and exact["psnr"] is not None:
-        against[0] = f"{quality['psnr'] - exact['psnr']:>+14.3f}"
-    if quality["ssim"] is not None and exact["ssim"] is not None:
-        against[1] = f"{quality['ssim'] - exact['ssim']:>+15.5f}"
-    to_exact = quality["psnr_exact"]
-    return row + "".join(against) + (f"{'equal':>13}" if to_exact is None else f"{to_exact:>13.2f}")
-
-
-class Quality(NamedTuple):
-    """Quality of an avatar's renders."""
-
-    psnr: float
-    """dB against the ground truth, mean over frames; NaN without one."""
-    ssim: float
-    """SSIM against the ground truth, mean over frames, with the window used in training."""
-    psnr_exact: float
-    """dB against the renders of the exact avatar, from the mean squared error over all frames; infinite if equal."""
-
-
 class Comparison:
-    """Held-out frames of a clip: renders of the exact avatar, and ground truth.
-
-    Parameters
-    ----------
-    form : AdaptedClip
-        The clip adapted to the method, whose poses animate the avatar.
-    frames : int
-        Number of frames, spread evenly over both held-out splits.
-    scale : int
-        Enlargement of the renders; above 1 there is no ground truth.
-    """
+    """Renders of the exact avatar and ground truth of a number of held-out ``frames``, spread evenly over both splits. ``form`` is
+    the clip adapted to the method; with an enlargement by ``scale`` above 1 there is no ground truth."""
 
     def __init__(self, clip: Clip, form: AdaptedClip, exact: Avatar, frames: int, scale: int = 1):
         self._clip, self._form, self._scale = clip, form, scale
@@ -216,10 +128,12 @@ class Comparison:
         return pictures
 
     def _quality(self, pictures: Sequence[ByteArray]) -> Quality:
-        against_exact = psnr(float(np.mean([squared_error(a, b) for a, b in zip(pictures, self._exact)])))
-        if self._truth is None:
-            return Quality(math.nan, math.nan, against_exact)
-        pairs = list(zip(pictures, self._truth))
-        decibels = [psnr(squared_error(*pair)) for pair in pairs]
-        similarity = [picture_ssim(*pair) for pair in pairs]
-        return Quality(float(np.mean(decibels)), float(np.mean(similarity)), against_exact)
+        to_exact = psnr(float(np.mean([squared_error(a, b) for a, b in zip(pictures, self._exact)])))
+        quality: Quality = {"psnr": None, "ssim": None, "psnr_exact": to_exact}
+        if self._truth is not None:
+            pairs = list(zip(pictures, self._truth))
+            quality["psnr"] = float(np.mean([psnr(squared_error(*pair)) for pair in pairs]))
+            quality["ssim"] = float(np.mean([picture_ssim(*pair) for pair in pairs]))
+        return {
+            name: value if value is None or math.isfinite(value) else None for name, value in quality.items()
+        }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 
 
 @dataclass(frozen=True)
@@ -11,40 +11,38 @@ class Precision:
 
     Each step is in a unit in which equal errors are equally visible, so that one number serves a whole part. With a capture,
     steps are those of a splat of average visibility in the training views, and others have steps in inverse proportion to
-    their visibility (`transform.visibility_classes`). The range of values needs no fixed number of bits because values are
-    entropy-coded. ``headbench export compact --compare`` measures what each costs.
+    their visibility (`coder.visibility_classes`). ``headbench export compact --compare`` measures what each costs.
     """
 
     step: float = 1.0
     """Factor of all steps: a coarser or finer codec with the same balance."""
 
-    positions: float = 0.07
+    positions: float = 0.08
     """Step of local positions, in the splat's own size (geometric mean of its three standard deviations)."""
 
-    scales: float = 0.04
-    """Step of log-scales: 0.04 is an error of at most 2 %."""
+    scales: float = 0.045
+    """Step of log-scales: 0.045 is an error of at most 2.3 %."""
 
-    rotations: float = 0.018
-    """Step of the three smaller components of unit quaternions: 0.018 is an error of about 0.6 degrees."""
+    rotations: float = 0.02
+    """Step of the components of quaternions: 0.02 is an error of about 0.7 degrees."""
 
-    opacities: float = 0.1
-    """Step of opacity logits: an opacity is off by 0.0125 at most."""
+    opacities: float = 0.12
+    """Step of opacity logits: an opacity is off by 0.015 at most."""
 
-    harmonics: float = 0.008
-    """Step of colours by spherical harmonics, in colour: root mean square over directions, see `colour_metric`."""
+    harmonics: float = 0.0115
+    """Step of colours by spherical harmonics, in colour: root mean square over directions."""
 
-    colors: float = 0.008
+    colors: float = 0.0115
     """Step of the separate colours of splats, added to those of the planes."""
 
-    planes: float = 0.008
+    planes: float = 0.0115
     """Step of the colour contribution of the channels of a plane, in [0, 1], as weighted by the colour network."""
 
-    lines: float = 0.008
-    """Step of the offset (logits) by the channels of one line at coefficient 1, as weighted by the offset network.
-    Small, since the errors of thousands of channels add up."""
+    lines: float = 0.012
+    """Step of the offset (logits) by the channels of one line at coefficient 1, as weighted by the offset network."""
 
-    networks: float = 0.015
-    """Step of network weights, relative to the largest weight of the same row: 1/127 would be 8 bits."""
+    networks: float = 0.01
+    """Step of network weights, relative to the largest weight of the same output: 1/127 would be 8 bits."""
 
     tables: float = 0.2
     """Step of trained features (of a hash grid, or of splats that a network shades), in their standard deviation."""
@@ -53,23 +51,21 @@ class Precision:
     """Step of the subject's static offset, metres."""
 
     def __post_init__(self) -> None:
-        for part in self.parts:
-            step = getattr(self, part)
+        for part, step in self.parts.items():
             if not 0 <= step < 1:
                 raise ValueError(f"{part} must be at least 0 and below 1, found {step}")
         if not 0 < self.step <= MAX_STEP:
             raise ValueError(f"step must be above 0 and at most {MAX_STEP:g}, found {self.step}")
 
     @property
-    def parts(self) -> tuple[str, ...]:
-        """Names of the parts."""
-        return tuple(part.name for part in fields(self) if part.name != "step")
+    def parts(self) -> dict[str, float]:
+        """Steps by part, without the factor."""
+        return {name: step for name, step in asdict(self).items() if name != "step"}
 
     @property
     def scaled(self) -> Precision:
         """The same steps with the factor 1."""
-        steps = {part: min(self.step * getattr(self, part), LARGEST_STEP) for part in self.parts}
-        return Precision(**steps)
+        return Precision(**{part: min(self.step * step, LARGEST_STEP) for part, step in self.parts.items()})
 
 
 MAX_STEP, LARGEST_STEP = 64.0, 0.999

@@ -12,7 +12,7 @@ from .precision import Precision
 
 @dataclass(frozen=True)
 class CompactSettings(CaptureOptions):
-    """Store an avatar of a native method by the common codec: quantised by visible effect, and entropy-coded."""
+    """Store an avatar of a native method by the common codec: quantised by visible effect, and compressed."""
 
     avatar: AvatarFolder
 
@@ -20,8 +20,8 @@ class CompactSettings(CaptureOptions):
     """Folder to write: the compact file, and the head model beside it."""
 
     compare: str | None = None
-    """Capture that the avatar was trained on. Steps follow the visibility of splats in its training views, those of ours that
-    are invisible in all training poses are removed, and quality is measured on held-out frames."""
+    """Capture that the avatar was trained on. Steps follow the visibility of splats in its training views, and quality is
+    measured on held-out frames."""
 
     frames: int = 8
     """With --compare: held-out frames to compare on, evenly spread over both held-out splits."""

@@ -24,7 +24,7 @@ def coded_name(step: float) -> str:
 
 def coded_summary(step: float) -> str:
     """Description of that variant."""
-    return "quantised by visible effect, entropy-coded" + (f", steps times {step:g}" if step != 1 else "")
+    return "quantised by visible effect, compressed" + (f", steps times {step:g}" if step != 1 else "")
 
 
 def _variants(module: str, name: str, folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
@@ -44,9 +44,9 @@ flashavatar_variants = partial(_variants, "flashavatar.method", "FlashAvatarAvat
 
 def make_coded(avatar_class: Any, folder: Path, clip: Clip, device: str, step: float, out: Path) -> Avatar:
     """Write the coded form of the avatar of a folder; return the avatar that is read back."""
-    from ..compact.codecs import DRIVING_FILE, write_coded
+    from ..compact.codecs import DRIVING_FILE, parts_of, write_coded
 
     avatar, head = avatar_class.read(folder, "cpu"), read_shared_head(folder)
-    write_coded(avatar, head, out, Precision(step=step), clip, folder / DRIVING_FILE)
+    write_coded(parts_of(avatar, head, clip), head, out, Precision(step=step), folder / DRIVING_FILE)
     coded: Avatar = avatar_class.read(out, device)
     return coded

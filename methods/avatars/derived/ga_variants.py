@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ....bench.contracts import Clip, HeadAsset, Variant
 from ...ga.method import GAAvatar
-from ...ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
+from ...ga.storage import BINDING, PLY_FILE, read_ga_splats, write_ga_splats
 from ...ops.harmonics import coefficient_count
 from ...shared.avatar_files import (
     COMPACT_FILE,
@@ -23,9 +23,7 @@ from ...shared.avatar_files import (
     write_subject,
 )
 from ...shared.subject_mesh import SubjectMesh
-from ..compact.bound import TRIANGLES, read_bound
-from ..compact.codecs import encode_avatar
-from ..compact.container import write_content
+from ..compact.codecs import parts_of, write_coded
 from ..compact.precision import Precision
 from ..views import training_views
 from .recipes import GA, Recipe, contributions, kept_rows, read_reduced, write_reduced
@@ -58,12 +56,12 @@ def _make(
         splats["sh_rest"] = splats["sh_rest"][:, :, : coefficient_count(recipe.degree) - 1].contiguous()
     save_shared_head(out, head)
     subject: Subject = whole.subject
+    stored = [out / COMPACT_FILE]
     if recipe.storage == "coded":
-        path = out / COMPACT_FILE
         reduced = GAAvatar([], whole.mesh, subject, splats, binding, whole.refined, device)
-        write_content(path, encode_avatar(reduced, head, Precision(step=recipe.step), clip))
-        subject, (splats, binding) = read_bound(path, head, device)
-        stored = [path]
+        write_coded(parts_of(reduced, head, clip), head, out, Precision(step=recipe.step), None)
+        coded = GAAvatar.read(out, device)
+        subject, splats, binding = coded.subject, coded.splat_tensors, coded.binding
     else:
         write_subject(out / SUBJECT_FILE, subject)
         subject = read_subject(out / SUBJECT_FILE, head)
@@ -76,11 +74,11 @@ def _make(
             tensors = {
                 **splats,
                 "opacities": splats["opacities"][:, None],
-                TRIANGLES: binding.to(torch.int32),
+                BINDING: binding.to(torch.int32),
             }
             write_reduced(path, tensors, recipe.storage)
             splats = {name: value.to(device) for name, value in read_reduced(path).items()}
-            binding = splats.pop(TRIANGLES).to(torch.int64)
+            binding = splats.pop(BINDING).to(torch.int64)
             splats["opacities"] = splats["opacities"][:, 0]
         stored = [path, out / SUBJECT_FILE]
     mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ....bench.contracts import Clip, HeadAsset, Variant
 from ...ours.avatar import OursAvatar
-from ...ours.storage import FIELD_FILE, PER_SPLAT, StoredField, checked_field, read_field, save_field
+from ...ours.storage import DYNAMIC, FIELD_FILE, PER_SPLAT, StoredField, field_of, read_field, save_field
 from ...shared.avatar_files import (
     COMPACT_FILE,
     SUBJECT_FILE,
@@ -21,9 +21,7 @@ from ...shared.avatar_files import (
     write_subject,
 )
 from ...shared.subject_mesh import SubjectMesh
-from ..compact.codecs import encode_avatar
-from ..compact.container import write_content
-from ..compact.file import read_compact
+from ..compact.codecs import parts_of, write_coded
 from ..compact.precision import Precision
 from ..views import training_views
 from .recipes import (
@@ -44,7 +42,7 @@ _ANY = 1 << 30  # no reduction
 
 def variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
     """The variants of `recipes.OURS` that change this avatar."""
-    whole = OursAvatar.read(folder, device, exact=(folder / FIELD_FILE).exists())
+    whole = OursAvatar.read(folder, device)
     head = read_shared_head(folder)
     weights = cache(lambda: contributions(whole, training_views(clip)))
     for recipe in OURS:
@@ -83,13 +81,12 @@ def _make(
     tensors = _resampled(tensors, recipe)
     field = StoredField(tensors, whole.field.dynamic)
     save_shared_head(out, head)
-    subject = whole.subject
+    subject, stored = whole.subject, [out / COMPACT_FILE]
     if recipe.storage == "coded":
-        path = out / COMPACT_FILE
         reduced = OursAvatar([], whole.mesh, subject, field, device)
-        write_content(path, encode_avatar(reduced, head, Precision(step=recipe.step), clip))
-        subject, field = read_compact(path, head, device)
-        stored = [path]
+        write_coded(parts_of(reduced, head, clip), head, out, Precision(step=recipe.step), None)
+        coded = OursAvatar.read(out, device)
+        subject, field = coded.subject, coded.field
     else:
         write_subject(out / SUBJECT_FILE, subject)
         path = out / FIELD_FILE
@@ -103,8 +100,7 @@ def _make(
             read = read_reduced(path)
             triangles = read.pop(TRIANGLES)[:, None].to(torch.float32)
             read["splats"] = torch.cat([read["splats"], triangles], dim=1)
-            checked_field(path, read, ",".join(field.dynamic), head)
-            field = field._replace(tensors={name: value.to(device) for name, value in read.items()})
+            field = field_of(path, read, {DYNAMIC: ",".join(field.dynamic)}, head, device)
         stored = [path, out / SUBJECT_FILE]
     mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
     return OursAvatar(stored, mesh, subject, field, device, recipe.cutoffs)

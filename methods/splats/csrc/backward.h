@@ -18,23 +18,18 @@ enum BackField {
   kBack            // then the colour gradients
 };
 
-// Floats per gradient record, with or without the absolute gradients.
-constexpr int gradient_stride(int channels, bool absolute) {
-  return (kMoments + channels + (absolute ? kAbsolutes : 0) + W - 1) / W * W;
-}
+// Floats per gradient record.
+constexpr int gradient_stride(int channels) { return (kMoments + channels + W - 1) / W * W; }
 
 inline std::size_t backward_scratch(int channels) {
   return chunk_floats(channels) + static_cast<std::size_t>(kBlocks) * (kBack + channels) * W +
-         gradient_stride(channels, true);
+         gradient_stride(channels);
 }
 
-// Pixels' v and w of up to W splats, kept until they can be summed over pixels for W splats at once; and what the
-// absolute gradients are sums of. The W splats are four groups of kBlockHeight. After the two transposes below, splat i
-// of the batch is at lane `place(i)`.
-template <bool Absolute>
+// Pixels' v and w of up to W splats, kept until they can be summed over pixels for W splats at once. The W splats are four
+// groups of kBlockHeight. After the two transposes below, splat i of the batch is at lane `place(i)`.
 struct Batch {
   alignas(64) float v[W * W], w[W * W];
-  alignas(64) float absolute[kAbsolutes][Absolute ? W * W : 1];
   alignas(64) float mean_x[W], mean_y[W];
   float* target[W];
 };
@@ -55,8 +50,7 @@ HEADBENCH_INLINE Real sum_columns(Real* groups) {
 
 // Sums over the block's pixels of v times 1, x, y, x², xy, y², in lane `place(i)` that of splat i. About the block's centre
 // first: small numbers, so that moving them to the splat's mean loses nothing.
-template <bool Absolute>
-HEADBENCH_INLINE void sum_moments(const Batch<Absolute>& batch, const Block& block, Real* out) {
+HEADBENCH_INLINE void sum_moments(const Batch& batch, const Block& block, Real* out) {
   Real plain[4], by_y[4], by_yy[4];
   for (int group = 0; group < 4; ++group) {
     Real rows[kBlockHeight];
@@ -89,20 +83,17 @@ HEADBENCH_INLINE void sum_moments(const Batch<Absolute>& batch, const Block& blo
 
 // Sum the first `used` of the batch over the block's pixels and add to the splats' gradient records. `by_row` is
 // the block's colour gradients, channel by channel, each row four times over: see `repeat_rows`.
-template <int C, bool Absolute>
-inline void flush(Batch<Absolute>& batch, int used, const Block& block, int channels, const float* by_row,
-                  float* spare) {
-  const int count = C ? C : channels, width = gradient_stride(count, Absolute);
+template <int C>
+inline void flush(Batch& batch, int used, const Block& block, int channels, const float* by_row, float* spare) {
+  const int count = C ? C : channels, width = gradient_stride(count);
   for (int i = used; i < W; ++i) {
     store(batch.v + i * W, 0.0f);
     store(batch.w + i * W, 0.0f);
-    if constexpr (Absolute)
-      for (int k = 0; k < kAbsolutes; ++k) store(batch.absolute[k] + i * W, 0.0f);
     batch.mean_x[place(i)] = batch.mean_y[place(i)] = 0.0f;
     batch.target[i] = spare;
   }
 
-  constexpr int kRoom = gradient_stride(C ? C : kChannelsMax, Absolute);
+  constexpr int kRoom = gradient_stride(C ? C : kChannelsMax);
   Real sums[kRoom];
   sum_moments(batch, block, sums);
   Real rows[4 * kBlockHeight];
@@ -117,16 +108,6 @@ inline void flush(Batch<Absolute>& batch, int used, const Block& block, int chan
     sums[kMoments + c] = sum_columns(groups);
   }
   int filled = kMoments + count;
-  if constexpr (Absolute)
-    for (int k = 0; k < kAbsolutes; ++k) {
-      Real groups[4];
-      for (int group = 0; group < 4; ++group) {
-        load_rows(batch.absolute[k], group, rows);
-        groups[group] = rows[0];
-        for (int r = 1; r < kBlockHeight; ++r) groups[group] = groups[group] + rows[r];
-      }
-      sums[filled++] = sum_columns(groups);
-    }
   while (filled < width) sums[filled++] = 0.0f;
 
   // Back to one record per splat, by the same two transposes.
@@ -154,11 +135,11 @@ HEADBENCH_INLINE void repeat_rows(const float* colors, int channels, float* by_r
 
 // Walk one block's list from its end; `gradients` are the chunk's records, row by row. Nothing is made of what is added
 // to `spare`.
-template <int C, bool Absolute>
+template <int C>
 inline void composite_block_backward(const Camera& view, const Chunk& chunk, int index, const Block& block,
                                      int channels, float* state, float* gradients, float* spare) {
   constexpr int kColors = C ? C : 1;
-  const int count = C ? C : channels, stride = record_stride(count), width = gradient_stride(count, Absolute);
+  const int count = C ? C : channels, stride = record_stride(count), width = gradient_stride(count);
   const float* colors = state + kBack * W;
   alignas(64) float by_row[(C ? C : kChannelsMax) * kBlockHeight * W];
   repeat_rows(colors, count, by_row);
@@ -167,7 +148,7 @@ inline void composite_block_backward(const Camera& view, const Chunk& chunk, int
   Real g[kColors];
   if constexpr (C != 0)
     for (int c = 0; c < C; ++c) g[c] = load(colors + c * W);
-  Batch<Absolute> batch;
+  Batch batch;
   int used = 0;
   for (int word = chunk.words - 1; word >= 0; --word) {
     for (std::uint64_t hits = chunk.hits_of(index)[word]; hits;) {
@@ -192,22 +173,17 @@ inline void composite_block_backward(const Camera& view, const Chunk& chunk, int
       const Mask unclamped = Real(kAlphaMax) >= a.raw;
       const Real value = zero_unless(unclamped, alpha * dalpha);
       store(batch.v + used * W, value);
-      if constexpr (Absolute) {
-        store(batch.absolute[0] + used * W, absolute(value * a.u));
-        const Real along_y = fma(row[kL21], a.u, Real(row[kL22]) * a.v);
-        store(batch.absolute[1] + used * W, absolute(value * along_y));
-      }
       store(batch.w + used * W, weight);
       batch.mean_x[place(used)] = row[kMeanX];
       batch.mean_y[place(used)] = row[kMeanY];
       batch.target[used] = gradients + in_chunk * width;
       if (++used == W) {
-        flush<C, Absolute>(batch, W, block, channels, by_row, spare);
+        flush<C>(batch, W, block, channels, by_row, spare);
         used = 0;
       }
     }
   }
-  if (used) flush<C, Absolute>(batch, used, block, channels, by_row, spare);
+  if (used) flush<C>(batch, used, block, channels, by_row, spare);
   store(state + kTransmittance * W, transmittance);
   store(state + kBehind * W, behind);
 }
@@ -244,11 +220,11 @@ inline void read_block(const Camera& view, const Splats& splats, const FrameData
   store(state + kStart * W, last);
 }
 
-template <int C, bool Absolute>
+template <int C>
 inline void draw_tile_backward_with(const Camera& view, const Splats& splats, const FrameData& frame,
                                     const Gradients& grads, int tile, float* scratch) {
   const int channels = C ? C : splats.channels, state_floats = (kBack + channels) * W;
-  const int width = gradient_stride(channels, Absolute);
+  const int width = gradient_stride(channels);
   float* states = scratch;
   float* spare = states + kBlocks * state_floats;
   Chunk chunk;
@@ -287,26 +263,19 @@ inline void draw_tile_backward_with(const Camera& view, const Splats& splats, co
     fill_chunk<C>(view, splats, frame, tile, begin, end, wanted, chunk);
     for (int b = 0; b < kBlocks; ++b)
       if (chunk.reaches(b))
-        composite_block_backward<C, Absolute>(view, chunk, b, block_of(view, tile, b), channels,
-                                              states + b * state_floats, sums, spare);
-  }
-}
-
-template <bool Absolute>
-inline void draw_tile_backward_as(const Camera& view, const Splats& splats, const FrameData& frame,
-                               const Gradients& grads, int tile, float* scratch) {
-  switch (splats.channels) {
-    case 1: return draw_tile_backward_with<1, Absolute>(view, splats, frame, grads, tile, scratch);
-    case 3: return draw_tile_backward_with<3, Absolute>(view, splats, frame, grads, tile, scratch);
-    case 4: return draw_tile_backward_with<4, Absolute>(view, splats, frame, grads, tile, scratch);
-    default: return draw_tile_backward_with<0, Absolute>(view, splats, frame, grads, tile, scratch);
+        composite_block_backward<C>(view, chunk, b, block_of(view, tile, b), channels, states + b * state_floats, sums,
+                                    spare);
   }
 }
 
 inline void draw_tile_backward(const Camera& view, const Splats& splats, const FrameData& frame,
                                const Gradients& grads, int tile, float* scratch) {
-  if (grads.means2d_abs) return draw_tile_backward_as<true>(view, splats, frame, grads, tile, scratch);
-  draw_tile_backward_as<false>(view, splats, frame, grads, tile, scratch);
+  switch (splats.channels) {
+    case 1: return draw_tile_backward_with<1>(view, splats, frame, grads, tile, scratch);
+    case 3: return draw_tile_backward_with<3>(view, splats, frame, grads, tile, scratch);
+    case 4: return draw_tile_backward_with<4>(view, splats, frame, grads, tile, scratch);
+    default: return draw_tile_backward_with<0>(view, splats, frame, grads, tile, scratch);
+  }
 }
 
 }  // namespace headbench::HEADBENCH_ISA

@@ -208,7 +208,7 @@ void Frame::backward(const Splats& splats, Gradients grads, float* background, f
   const int channels = splats.channels;
   const Scratch scratch(kernels_.scratch_floats(channels), threads);
   Buffer<float> records;
-  grads.record_stride = static_cast<int>(rounded_up(kMoments + channels + (grads.means2d_abs ? kAbsolutes : 0), kernels_.lanes));
+  grads.record_stride = static_cast<int>(rounded_up(kMoments + channels, kernels_.lanes));
   grads.records = records.resize(data_.tile_begin[tiles] * std::size_t{1} * grads.record_stride);
   std::vector<double> tile_background(static_cast<std::size_t>(tiles) * channels);
   grads.background = tile_background.data();

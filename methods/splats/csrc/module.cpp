@@ -94,7 +94,6 @@ void backward(Frame& frame, const nb::tuple& inputs, const nb::tuple& by_image, 
   grads.colors = to(count, channels);
   grads.means2d = to.optional(count, 2);
   float *background = to(channels), *by_viewmat = to_camera(4, 4), *by_K = to_camera(3, 3);
-  grads.means2d_abs = to_camera.optional(count, 2);
   require(frame.fits(splats) && frame.fits(width, height) && !grads.means2d == !splats.offset && threads >= 1);
   float view_gradient[kViewGradient];
   {
@@ -156,8 +155,7 @@ NB_MODULE(_kernel, m) {
   m.def("forward", &forward, "inputs"_a, "camera"_a, "outputs"_a, "instruction_set"_a, "threads"_a,
         "Draw into image, alpha and radii.");
   m.def("backward", &backward, "frame"_a, "inputs"_a, "by_image"_a, "by_inputs"_a, "by_camera"_a, "threads"_a,
-        "Add the gradients of drawn splats; write those of background and camera. After the camera's come absolute "
-        "gradients of the 2D means, or None.");
+        "Add the gradients of drawn splats; write those of background and camera.");
   bind_operations(m);
   bind_network_training(m);
   m.def("instruction_sets", [] { return names_of(runnable_kernels()); }, "Variants this machine can run, the fastest first.");

@@ -135,18 +135,17 @@ inline void project_backward(const Camera& view, const Splats& splats, const Fra
     const int used = static_cast<int>(end - first < W ? end - first : W);
     if (first == begin) prefetch_records(frame, grads, begin, begin + used);
     SplatLanes in;
-    alignas(64) float moments[kMoments][W], absolutes[kAbsolutes][W];
+    alignas(64) float moments[kMoments][W];
     for (int lane = 0; lane < W; ++lane) {
       const std::int64_t splat = frame.drawn[first + (lane < used ? lane : 0)];
       load_lane(splats, splat, lane, in);
       if (first + W + lane < end) prefetch_records(frame, grads, first + W + lane, first + W + lane + 1);
       if (lane >= used) {
         for (int k = 0; k < kMoments; ++k) moments[k][lane] = 0.0f;
-        for (int k = 0; k < kAbsolutes; ++k) absolutes[k][lane] = 0.0f;
         continue;
       }
       // A splat's records are added in the order of its entries: the sum does not depend on who drew the tiles.
-      alignas(64) float sum[kMoments + kChannelsMax + kAbsolutes + 2 * W];
+      alignas(64) float sum[kMoments + kChannelsMax + 2 * W];
       const EntryRange range = frame.ranges[splat];
       for (int i = 0; i < vectors; ++i) {
         Real total = 0.0f;
@@ -156,8 +155,6 @@ inline void project_backward(const Camera& view, const Splats& splats, const Fra
       }
       for (int k = 0; k < kMoments; ++k) moments[k][lane] = sum[k];
       for (int c = 0; c < channels; ++c) grads.colors[splat * channels + c] += sum[kMoments + c];
-      if (grads.means2d_abs)
-        for (int k = 0; k < kAbsolutes; ++k) absolutes[k][lane] = sum[kMoments + channels + k];
     }
 
     CameraLanes camera;
@@ -169,8 +166,7 @@ inline void project_backward(const Camera& view, const Splats& splats, const Fra
     SplatGradients g;
     project_lanes_backward(view, p, lanes, load(in.opacity), g, view_lanes);
 
-    alignas(64) float mean2d[2][W], mean[3][W], quat[4][W], scale[3][W], opacity[W], l11[W], lane_view[W];
-    store(l11, p.l11);
+    alignas(64) float mean2d[2][W], mean[3][W], quat[4][W], scale[3][W], opacity[W], lane_view[W];
     for (int k = 0; k < 2; ++k) store(mean2d[k], g.mean2d[k]);
     for (int k = 0; k < 3; ++k) store(mean[k], g.mean[k]);
     for (int k = 0; k < 4; ++k) store(quat[k], g.quat[k]);
@@ -188,10 +184,6 @@ inline void project_backward(const Camera& view, const Splats& splats, const Fra
       grads.opacities[splat] += opacity[lane];
       if (grads.means2d)
         for (int k = 0; k < 2; ++k) grads.means2d[2 * splat + k] += mean2d[k][lane];
-      if (grads.means2d_abs) {
-        grads.means2d_abs[2 * splat] += 2.0f * kLn2 * l11[lane] * absolutes[0][lane];
-        grads.means2d_abs[2 * splat + 1] += 2.0f * kLn2 * absolutes[1][lane];
-      }
     }
   }
 }

@@ -24,10 +24,8 @@ constexpr int kChannelsMax = 32;
 constexpr int kRecordUnit = 16;  // floats: records are whole cache lines, as drawing reads them at random
 enum RecordField { kMeanX, kMeanY, kL11, kL21, kL22, kLog2Opacity, kRestX, kRestY, kGeometry };
 
-// A gradient record holds moments of the alpha gradient over pixels, then the gradient of the colour, then, where they
-// are asked for, two sums that become the absolute gradient of the 2D mean.
+// A gradient record holds moments of the alpha gradient over pixels, then the gradient of the colour.
 enum GradientField { kSum, kSumX, kSumY, kSumXX, kSumXY, kSumYY, kMoments };
-constexpr int kAbsolutes = 2;
 
 // Rows of the rotation, the translation, then fx, fy, cx, cy.
 constexpr int kViewGradient = 16;
@@ -113,7 +111,6 @@ struct Gradients {
   float* opacities;        // (N,)
   float* colors;           // (N, C)
   float* means2d;          // (N, 2) or null
-  float* means2d_abs;      // (N, 2) or null
 };
 
 // The work of drawing a frame, in pairs of a splat and a pixel.

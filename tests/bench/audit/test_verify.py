@@ -12,6 +12,7 @@ from headbench.bench.engine import run as runner
 from headbench.bench.engine.captures import run_configuration
 from headbench.bench.engine.config import RunOptions
 from headbench.bench.engine.store import RunFolder
+from headbench.bench.errors import UnavailableError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.images import read_png, write_png
@@ -124,6 +125,16 @@ def test_another_capture_is_found_whatever_is_cached(verify, toy, monkeypatch):
     code, found = verify()
     assert code == 1
     assert "expected toy-subject1, found another, cached False" in found["mismatches"][0]
+
+
+def test_a_metric_that_is_unavailable_here_is_not_verified(verify, monkeypatch):
+    def unavailable(*images):
+        raise UnavailableError("no weights", "Download them.")
+
+    monkeypatch.setattr("headbench.metrics.psnr.psnr", unavailable)
+    code, found = verify()
+    assert (code, found["values"]) == (0, 1)
+    assert "no weights" in found["unverified"]["psnr"]
 
 
 def test_what_is_no_finished_run_gives_no_verdict(run, tmp_path):

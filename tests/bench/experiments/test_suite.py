@@ -144,7 +144,7 @@ def test_every_subject_has_a_run_and_the_first_also_large_images(asked):
     assert [condition.name for condition in later[1][1].conditions] == [""]
 
 
-def test_every_ablation_changes_ours_and_additions_make_ours_plus():
+def test_ablations_change_ours_and_additions_make_ours_plus():
     additions = reduce(merge, ADDITIONS.values(), {})
     for preset in OURS.presets:
         plain = resolve_method(OURS, preset, {}).config

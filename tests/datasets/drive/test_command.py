@@ -14,9 +14,9 @@ from headbench.bench.io.images import read_png
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
 
+from ..head.skinning import skinned
 from ..head.toy import toy_head
 from .mesh_method import SPEC, VIDEO, write_mesh_avatar
-from .skinning import skinned
 
 HEAD = toy_head(24, eyelids=True, version="flame2020")
 RNG = np.random.default_rng(0)
@@ -76,17 +76,8 @@ def test_a_folder_is_a_capture_of_the_driven_poses(place, capsys):
     assert {*data["unused"]} == {"shape"}
     assert read_json(Path("out") / "drive.json")["frames"] == FRAMES
     # Another command renders the capture's poses and gives the capture's images.
-    words = [
-        "render",
-        "avatar",
-        "--capture",
-        data["written"],
-        "--out",
-        "again",
-        "--method",
-        "mesh_method:SPEC",
-    ]
-    assert cli.main(words) == 0
+    words = ["render", "avatar", "--capture", data["written"], "--out", "again"]
+    assert cli.main([*words, "--method", "mesh_method:SPEC"]) == 0
     found = sorted(Path("again/self_reenactment").iterdir())
     assert len(found) == FRAMES
     for path, key in zip(found, keys):
@@ -157,9 +148,6 @@ def test_an_identity_of_its_own_is_kept(place, capsys):
     np.testing.assert_allclose(read_capture("out").shape, shape)
 
 
-# ------------------------------------------------------------------ refused
-
-
 def csv(text):
     Path("signal.csv").write_text(text)
     return "signal.csv"
@@ -182,6 +170,15 @@ def mapped(text, table="a,b\n1,2\n"):
 
 ONE = np.zeros((FRAMES, 8))
 MAP = ("--map", "map.yaml")
+
+
+def arrays():
+    """A folder of frames that are no parameter files."""
+    Path("arrays").mkdir()
+    np.save("arrays/0.npy", np.zeros(5))
+    return "arrays"
+
+
 REFUSED = {
     "no file": (lambda: "none.csv", (), "no such file"),
     "empty csv": (lambda: csv(""), (), "empty file"),
@@ -212,6 +209,19 @@ REFUSED = {
     "map of both kinds": (lambda: mapped("a: {jaw.0: 1, jawOpen: 1}"), MAP, "alone"),
     "map without numbers": (lambda: mapped("a: {jaw.0: much}"), MAP, "a.jaw.0"),
     "an empty map": (lambda: mapped(""), MAP, "an empty map"),
+    "a map of nothing": (lambda: mapped("a: {}"), MAP, "an empty map"),
+    "a huge number": (lambda: lines('{"jawOpen": 1' + "0" * 400 + "}"), (), "a number or a list of numbers"),
+    "an empty list": (lambda: lines('{"jawOpen": []}'), (), "a number or a list of numbers"),
+    "nested lists": (lambda: lines('{"exp": [[[1], [1, 2]]]}'), (), "a number or a list of numbers"),
+    "two numbers": (lambda: lines('{"jawOpen": [0.1, 0.9]}'), (), "jawOpen: expected one number"),
+    "no blendshape": (lambda: csv("time\n0\n"), ("--form", "blendshapes"), "a column with ARKit's name"),
+    "a shape twice": (lambda: csv("jawOpen,JawOpen\n0.5,0.1\n"), (), "one column for jawOpen, found two"),
+    "arrays as parameters": (
+        arrays,
+        ("--form", "flame_param", "--signal-head", "avatar"),
+        ".npz file of parameters",
+    ),
+    "a missing head": (lambda: "signal.npz", ("--signal-head", "typo.pkl"), "--signal-head"),
     "no map": (lambda: csv("jawOpen\n1\n"), ("--map", "none.yaml"), "none.yaml"),
     "an unknown head": (lambda: "signal.npz", ("--signal-head", "2021"), "2020, 2023"),
     "no head with shapes": (lambda: csv("jawOpen\n1\n"), ("--signal-head", "avatar"), "ARKit's names"),
@@ -243,19 +253,13 @@ def test_signals_of_another_head_need_it_named(place, capsys):
     assert data["refit_residual_mm"] < 0.02
 
 
-def test_an_avatar_without_a_head_needs_a_capture(place, capsys):
+def test_other_inputs_are_refused(place, capsys, pristine_capture):
+    """Options without effect, an avatar without a head or a capture, another subject's capture."""
+    assert drive(capsys, "--camera", "1")[0] == drive(capsys, "--capture", "x", "--size", "64")[0] == 2
+    union = pristine_capture.union
+    write_mesh_avatar(place / "else", read_head(union / "head_model.npz"), subject="someone", spec=SPEC)
+    code, _, error = drive(capsys, "--capture", str(union), avatar="else")
+    assert (code, "an avatar of 901" in error) == (2, True), error
     (place / "avatar" / "head_model.npz").unlink()
     code, _, error = drive(capsys)
     assert (code, "--capture" in error) == (2, True)
-
-
-@pytest.mark.parametrize("words", [("--camera", "1"), ("--capture", "x", "--size", "64")])
-def test_options_without_effect_are_refused(place, capsys, words):
-    assert drive(capsys, *words)[0] == 2
-
-
-def test_another_subjects_capture_is_no_stage(place, capsys, pristine_capture):
-    head = read_head(pristine_capture.union / "head_model.npz")
-    write_mesh_avatar(place / "else", head, subject="someone", spec=SPEC)
-    code, _, error = drive(capsys, "--capture", str(pristine_capture.union), avatar="else")
-    assert (code, "an avatar of 901" in error) == (2, True), error

@@ -20,8 +20,8 @@ from headbench.datasets.head.procedural.versions import version_shapes
 from headbench.datasets.head.subject import pose_in_head_frame
 
 from ..head.refit.heads import subdivided
+from ..head.skinning import skinned
 from ..head.toy import toy_head
-from .skinning import skinned
 
 procedural_head = functools.cache(model.procedural_head)
 FRAMES = 4
@@ -53,9 +53,6 @@ def gaps_mm(vertices, wanted, head=SOURCE):
     return 1e3 * np.linalg.norm(vertices[face] - wanted[face], axis=1)
 
 
-# ------------------------------------------------------------------ coefficients
-
-
 def emoca(path):
     for frame in range(FRAMES):
         (path / f"{frame}_000").mkdir(parents=True)
@@ -74,12 +71,8 @@ def deca(path):
 
 
 def smirk(path):
-    columns = {
-        "expression_params": EXPRESSION,
-        "jaw_params": JAW,
-        "pose_params": GLOBAL,
-        "eyelid_params": LIDS,
-    }
+    columns = {"expression_params": EXPRESSION, "jaw_params": JAW}
+    columns |= {"pose_params": GLOBAL, "eyelid_params": LIDS}
     frames = [{name: [values[t].tolist()] for name, values in columns.items()} for t in range(FRAMES)]
     path.with_suffix(".json").write_text(json.dumps({"frames": frames}))
     return path.with_suffix(".json"), {"eyes": np.zeros(6)}
@@ -116,9 +109,6 @@ def test_one_file_with_one_frame_is_a_signal(tmp_path):
     assert gaps_mm(found[0], skinned(SOURCE, EXPRESSION[1], jaw=JAW[1])).max() < 1e-6
 
 
-# ------------------------------------------------------------------ FLAME parameters, captures
-
-
 def test_flame_parameters_leave_the_identity_behind(tmp_path):
     rng = np.random.default_rng(0)
     still = {
@@ -127,12 +117,8 @@ def test_flame_parameters_leave_the_identity_behind(tmp_path):
     }
     for frame in range(FRAMES):
         pose = {"rotation": GLOBAL[frame], "neck_pose": np.zeros(3), "translation": np.ones(3)}
-        pose |= {
-            "expr": EXPRESSION[frame],
-            "jaw_pose": JAW[frame],
-            "eyes_pose": EYES[frame],
-            "eyelids": LIDS[frame],
-        }
+        pose |= {"expr": EXPRESSION[frame], "jaw_pose": JAW[frame]}
+        pose |= {"eyes_pose": EYES[frame], "eyelids": LIDS[frame]}
         save_npz(tmp_path / "flame_param" / f"{frame:05d}.npz", {**pose, **still})
     signal, found = driven(tmp_path / "flame_param", signal_head="avatar")
     assert (signal.form, len(found)) == ("flame_param", FRAMES)
@@ -177,19 +163,9 @@ def test_meshes_that_differ_meet_by_closest_points(tmp_path):
         assert gaps_mm(found[frame], wanted).mean() < 0.1 * moved
 
 
-# ------------------------------------------------------------------ blendshapes
-
-
-SHAPES = {
-    "mouthSmileLeft": ("smile_left", 1),
-    "browInnerUp": ("brow_inner_up", 1),
-    "eyeBlinkRight": ("blink_right", 1),
-}
-SHAPES |= {
-    "mouthPucker": ("pucker", 1),
-    "mouthLeft": ("mouth_left", 1),
-    "mouthFrownLeft": ("mouth_frown", 0.5),
-}
+SHAPES = {"mouthSmileLeft": ("smile_left", 1), "browInnerUp": ("brow_inner_up", 1)}
+SHAPES |= {"eyeBlinkRight": ("blink_right", 1), "mouthPucker": ("pucker", 1)}
+SHAPES |= {"mouthLeft": ("mouth_left", 1), "mouthFrownLeft": ("mouth_frown", 0.5)}
 VALUES = np.random.default_rng(5).uniform(0, 0.6, size=(FRAMES, len(SHAPES)))
 
 
@@ -213,13 +189,8 @@ def live_link(path):
         cells = [f"{values.get(name, 0.0):.9f}" for name in ARKIT]
         lines.append(",".join([f"00:00:01:{frame:02d}.500", "61", *cells, "0.1"]))
     path.with_suffix(".csv").write_text("\n".join(lines))
-    return path.with_suffix(".csv"), {
-        "Timecode",
-        "BlendShapeCount",
-        "HeadYaw",
-        "mouthShrugUpper",
-        "tongueOut",
-    }
+    unused = {"Timecode", "BlendShapeCount", "HeadYaw", "mouthShrugUpper", "tongueOut"}
+    return path.with_suffix(".csv"), unused
 
 
 def mediapipe(path):
@@ -279,9 +250,6 @@ def test_a_head_with_arkits_names_performs_its_own_shapes(tmp_path):
     assert gaps_mm(found[0], wanted).mean() < 0.02
 
 
-# ------------------------------------------------------------------ tables of one's own
-
-
 def test_a_map_takes_columns_to_coefficients(tmp_path):
     (tmp_path / "a.csv").write_text("frame;x,grin,mouth,who\n0,0.5,0.25,me\n1,-1,0.5,me\n")
     (tmp_path / "map.yaml").write_text("grin: {expression.2: 2.0, expression.0: -1}\nmouth: {jaw.0: 0.4}\n")
@@ -308,82 +276,18 @@ def test_parameters_of_headbenchs_own_writer_are_read(tmp_path):
     np.testing.assert_allclose(again.poses[0].expression, pose.expression, rtol=1e-6)
 
 
-# ------------------------------------------------------------------ what is refused, and what is said
-
-
-def _npy_folder(path):
-    path.mkdir()
-    names = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
-    for name in names:
-        np.save(path / f"{name}.npy", np.zeros((FRAMES, 3)))
-    return path
-
-
-WRITTEN = {
-    "huge.jsonl": '{"jawOpen": 1' + "0" * 400 + "}",
-    "empty.jsonl": '{"jawOpen": []}',
-    "two.jsonl": '{"jawOpen": [0.1, 0.9]}',
-    "time.csv": "time\n0\n1\n",
-    "twice.csv": "jawOpen,JawOpen\n0.5,0.1\n",
-    "nested.json": '{"exp": [[[1], [1, 2]], [[1], [1, 2]]]}',
-}
-
-
 @pytest.mark.parametrize(
-    ("name", "form", "message"),
-    [
-        ("huge.jsonl", "", "a number or a list of numbers"),
-        ("empty.jsonl", "", "a number or a list of numbers"),
-        ("two.jsonl", "", "jawOpen: expected one number a frame, found 2"),
-        ("time.csv", "blendshapes", "a column with ARKit's name"),
-        ("twice.csv", "", "one column for jawOpen, found two"),
-        ("nested.json", "", "a number or a list of numbers"),
-    ],
+    ("options", "key"),
+    [({}, "--sequence"), ({"sequence": "FREE", "signal_head": "typo.pkl"}, "--signal-head")],
 )
-def test_values_that_are_no_numbers_are_refused(tmp_path, name, form, message):
-    (tmp_path / name).write_text(WRITTEN[name])
-    with pytest.raises(InputError, match=message):
-        driven(tmp_path / name, form=form, signal_head="avatar")
-
-
-def test_a_folder_of_arrays_is_no_folder_of_flame_parameters(tmp_path):
-    with pytest.raises(InputError):
-        driven(_npy_folder(tmp_path / "arrays"), form="flame_param")
-
-
-@pytest.mark.parametrize("text", ["{}", "jaw: {}"])
-def test_an_empty_map_is_refused(tmp_path, text):
-    (tmp_path / "a.csv").write_text("jaw\n0.1\n")
-    (tmp_path / "map.yaml").write_text(text)
-    with pytest.raises(InputError, match="an empty map"):
-        driven(tmp_path / "a.csv", map=str(tmp_path / "map.yaml"))
-
-
-def test_a_head_model_that_does_not_exist_is_refused(tmp_path, pristine_capture):
-    for path, options in ((pristine_capture.union, {"sequence": "FREE"}), (write_json(tmp_path), {})):
-        with pytest.raises(InputError, match="--signal-head"):
-            driven(path, signal_head=str(tmp_path / "typo.pkl"), **options)
-
-
-def write_json(folder):
-    path = folder / "a.json"
-    path.write_text(json.dumps({"frames": [{"exp": [0.0] * 6}]}))
-    return path
-
-
-def test_a_capture_of_several_sequences_needs_one(pristine_capture):
-    with pytest.raises(InputError, match="--sequence: expected one of"):
-        driven(pristine_capture.union)
+def test_captures_need_a_sequence_and_the_head_that_is_named(pristine_capture, options, key):
+    with pytest.raises(InputError, match=key):
+        driven(pristine_capture.union, **options)
 
 
 def test_eyes_and_poses_that_drive_nothing_are_listed(tmp_path):
-    frame = {
-        "exp": [0.0] * 6,
-        "rotation": [0.0] * 3,
-        "jaw": [0.0] * 3,
-        "pose": [0.1] * 6,
-        "eye_l_pose": [0.1] * 3,
-    }
+    frame = {"exp": [0.0] * 6, "rotation": [0.0] * 3, "jaw": [0.0] * 3, "pose": [0.1] * 6}
+    frame["eye_l_pose"] = [0.1] * 3
     (tmp_path / "a.json").write_text(json.dumps({"frames": [frame]}))
     signal, _ = driven(tmp_path / "a.json", signal_head="avatar")
     assert {"pose", "eye_l_pose"} <= signal.unused.keys()

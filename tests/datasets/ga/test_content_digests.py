@@ -1,10 +1,9 @@
 """Digests by content, and when the remembered ones are used."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
+from unittest.mock import Mock
 
 import pytest
 
@@ -88,11 +87,7 @@ def test_a_home_that_cannot_be_written_is_no_obstacle(capture, tmp_path, monkeyp
     if home == "a file":
         (tmp_path / "cache").write_text("no folder")
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    else:
-
-        def homeless():
-            raise RuntimeError("Could not determine home directory.")
-
+    else:  # Python raises RuntimeError where it cannot determine a home
         monkeypatch.delenv("XDG_CACHE_HOME")
-        monkeypatch.setattr(module.Path, "home", homeless)
+        monkeypatch.setattr(module.Path, "home", Mock(side_effect=RuntimeError))
     assert content_digests(capture.iterdir(), cached_for=capture) == expected(capture)

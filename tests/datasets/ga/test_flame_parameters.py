@@ -1,7 +1,5 @@
 """Parameter files as trackers leave them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,36 +71,31 @@ def test_first_timestep_rules_and_what_is_ignored_is_measured(tmp_path):
     assert tracking.notes["dynamic_offset_ignored_m"] == 0.25
 
 
-def test_static_offset_that_changes_its_size_is_refused(tmp_path):
-    with pytest.raises(InputError, match="as at the first timestep"):
-        read_tracking(
-            write_files(tmp_path, static_offset=lambda t: np.zeros((1, VERTICES + t, 3))), HEAD, "s"
-        )
-    with pytest.raises(InputError, match="00001.npz, static_offset: expected none"):
-        read_tracking(
-            write_files(tmp_path, static_offset=lambda t: np.zeros((1, VERTICES, 3)) if t else None),
-            HEAD,
-            "s",
-        )
+REFUSED = {
+    "00001.npz, static_offset": {"static_offset": lambda t: np.zeros((1, VERTICES + t, 3))},
+    "00001.npz, static_offset:": {"static_offset": lambda t: np.zeros((1, VERTICES, 3)) if t else None},
+    "jaw_pose": {"jaw_pose": lambda t: np.ones((2, 3))},
+    "jaw_pose:": {"jaw_pose": lambda t: np.ones((1, 3, 1))},
+    "shape, static_offset": {"shape": lambda t: np.full((1, 6), 5000.0)},
+    "shape, static_offset:": {"static_offset": lambda t: np.full((1, VERTICES, 3), 20.0)},
+}
 
 
-@pytest.mark.parametrize("shape", [(2, 3), (3,), (1, 3, 1)])
-def test_rows_may_lack_the_batch_axis_and_nothing_else(tmp_path, shape):
-    files = write_files(tmp_path, jaw_pose=lambda t: np.ones(shape))
-    if shape == (3,):
-        assert read_tracking(files, HEAD, "s").poses[0].jaw.shape == (3,)
-    else:
-        with pytest.raises(InputError, match=r"jaw_pose: expected shape \(1, 3\)"):
-            read_tracking(files, HEAD, "s")
+@pytest.mark.parametrize("name", REFUSED)
+def test_faulty_parameters_are_refused(tmp_path, name):
+    with pytest.raises(InputError, match=name):
+        read_tracking(write_files(tmp_path, **REFUSED[name]), HEAD, "s")
+
+
+def test_rows_may_lack_the_batch_axis(tmp_path):
+    files = write_files(tmp_path, jaw_pose=lambda t: np.ones(3))
+    assert read_tracking(files, HEAD, "s").poses[0].jaw.shape == (3,)
 
 
 def test_numbers_that_overflow_float32_are_refused(tmp_path):
     files = write_files(tmp_path)
-    arrays = dict(np.load(files[1]))
-    np.savez(files[1], **{**arrays, "expr": np.full((1, 5), 1e39)})
-    with pytest.raises(
-        InputError, match=r"00001.npz, expr: expected numbers from -10000 to 10000, found one of size 1e\+39"
-    ):
+    np.savez(files[1], **{**np.load(files[1]), "expr": np.full((1, 5), 1e39)})
+    with pytest.raises(InputError, match=r"00001.npz, expr: expected numbers from"):
         read_tracking(files, HEAD, "s")
 
 
@@ -138,16 +131,3 @@ def test_teeth_policies():
     ]:
         with pytest.raises(InputError, match="regions"):
             resolve_teeth(head, rows, policy, file)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"shape": lambda t: np.full((1, 6), 5000.0)},
-        {"static_offset": lambda t: np.full((1, VERTICES, 3), 20.0)},
-    ],
-)
-def test_coefficients_that_make_no_head_are_refused(tmp_path, change):
-    with pytest.raises(InputError) as caught:
-        read_tracking(write_files(tmp_path, **change), HEAD, "s")
-    assert caught.value.key == "shape, static_offset"

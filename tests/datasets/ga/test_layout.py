@@ -1,7 +1,5 @@
 """Names and conventions of the layout, against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -52,10 +50,8 @@ def test_sequence_folder_names(folder, subject, sequence):
 @pytest.mark.parametrize(
     ("folder", "subject"),
     [
-        ("UNION10_306_EMO1234EXP234589_v16_DS2-0.5x_lmkSTAR_teethV3_SMOOTH", "306"),
-        ("UNION_074", "074"),
-        ("UNION20_a1", "a1"),
-        ("074_EMO-1_v16", ""),
+        *(("UNION10_306_EMO1234EXP234589_v16_DS2-0.5x_lmkSTAR_teethV3_SMOOTH", "306"), ("UNION_074", "074")),
+        *(("UNION20_a1", "a1"), ("074_EMO-1_v16", "")),
     ],
 )
 def test_union_folder_names(folder, subject):

@@ -1,13 +1,10 @@
 """Reading what the writer wrote and what the field's tools write."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -25,8 +22,6 @@ from ..tiny_capture import (
     SERIALS,
     edit_npz,
     make_plan,
-    posed_vertices,
-    projected,
     rig,
     write_tiny_capture,
 )
@@ -84,17 +79,14 @@ def test_splits_hold_out_the_frontal_camera_and_free(clip):
     assert clip.excluded == dict.fromkeys(keys([6], SERIALS), "tongue out")
 
 
-def test_eyelids_survive(tmp_path):
-    plan = make_plan(head=toy_head(16, eyelids=True), lengths={"FREE": 1, "HAIR": 1})
-    written = write_tiny_capture(tmp_path, plan)
-    clip = read_capture(written.union)
-    np.testing.assert_array_equal(clip.poses[0].eyelids, plan.sequence("HAIR").poses[0].eyelids)
-
-
-def test_eyelids_that_the_head_model_lacks_are_said(tmp_path, caplog):
+def test_eyelids_survive_or_are_said_to_be_left_out(tmp_path, caplog):
     head = toy_head(16, eyelids=True)
-    written = write_tiny_capture(tmp_path, make_plan(head=head, lengths={"FREE": 1, "HAIR": 1}))
-    clip = read_capture(written.union, head=replace(head, eyelid_basis=None))
+    plan = make_plan(head=head, lengths={"FREE": 1, "HAIR": 1})
+    union = write_tiny_capture(tmp_path, plan).union
+    np.testing.assert_array_equal(
+        read_capture(union).poses[0].eyelids, plan.sequence("HAIR").poses[0].eyelids
+    )
+    clip = read_capture(union, head=replace(head, eyelid_basis=None))
     assert "left out: the head model has no basis" in clip.steps[0].parameters["eyelids"]
     assert "Put l_eyelid.npy and r_eyelid.npy" in caplog.text
 
@@ -112,11 +104,7 @@ def test_a_single_sequence_is_read_with_its_declared_head(pristine_capture):
 def test_one_camera_has_no_novel_view(tmp_path):
     plan = make_plan(cameras=rig()[:1], novel_view_cameras=())
     clip = read_capture(write_tiny_capture(tmp_path, plan).union)
-    assert {name: len(keys) for name, keys in clip.splits.items()} == {
-        "train": 4,
-        "novel_view": 0,
-        "self_reenactment": 2,
-    }
+    assert [len(clip.splits[name]) for name in ("train", "novel_view", "self_reenactment")] == [4, 0, 2]
 
 
 def test_captures_of_one_head_model_share_it_in_memory(pristine_capture):
@@ -130,9 +118,6 @@ def test_captures_are_found_from_the_folder_above(pristine_capture, tmp_path):
     assert read_capture(root).fingerprint == read_capture(pristine_capture.union).fingerprint
     with pytest.raises(InputError, match="an empty folder"):
         read_capture(tmp_path)
-
-
-# ------------------------------------------------------------------ files in the field's own manner
 
 
 def write_ga_style(root: Path, plan, *, shifts=(0.0, 0.0), offset_rows: int | None = None) -> Path:
@@ -215,9 +200,6 @@ def test_teeth_are_appended_and_the_offset_padded(tmp_path, rows_in_file):
         read_capture(write_ga_style(tmp_path / "other", plan, offset_rows=len(bare.template) - 7), head=bare)
 
 
-# ------------------------------------------------------------------ the principal point
-
-
 @pytest.mark.parametrize("written", ["top", "bottom"])
 def test_undeclared_cy_is_told_from_the_images(tmp_path, written):
     plan = make_plan(cy=written, cameras=rig(72, 96, cy=44.0), lengths={"FREE": 2, "EMO-1-shout+laugh": 4})
@@ -251,22 +233,6 @@ def test_cy_near_the_centre_needs_no_decision(tmp_path):
     assert "immaterial" in read_capture(capture.union).steps[0].parameters["cy_from"]["source"]
 
 
-def test_projected_mesh_lies_on_the_mask(clip):
-    """Cameras, poses, offset and principal point together: vertices fall on the foreground."""
-    plan = make_plan()
-    for key in clip.splits["self_reenactment"]:
-        camera = clip.cameras[key.camera]
-        vertices = posed_vertices(plan, clip.poses[key.timestep])
-        x, y = np.floor(projected(vertices, camera)).astype(int).T
-        inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-        near = cv2.dilate(clip.mask(key), np.ones((3, 3), np.uint8))  # a vertex may touch an uncovered pixel
-        assert inside.mean() > 0.95
-        assert (near[y[inside], x[inside]] > 0).all()
-
-
-# ------------------------------------------------------------------ splits, heads, fingerprints
-
-
 def test_splits_can_be_made_anew(capture):
     clip = read_capture(capture.union, held_out_sequences=["SEN-01"], held_out_cameras=[SERIALS[0]])
     assert {key.sequence for key in clip.splits["self_reenactment"]} == {"SEN-01-cramp_small_danger"}
@@ -280,10 +246,10 @@ def test_splits_can_be_made_anew(capture):
 
 
 def test_missing_and_other_head_models_are_refused(capture):
-    with pytest.raises(InputError, match="head_model: expected other"):
+    with pytest.raises(InputError, match="head_model"):
         read_capture(capture.union, head=toy_head(16, version="other"))
     (capture.union / "head_model.npz").unlink()
-    with pytest.raises(InputError, match=r"head_model.npz: .*no such file.*flame2023.pkl"):
+    with pytest.raises(InputError, match=r"head_model.npz"):
         read_capture(capture.union)
 
 

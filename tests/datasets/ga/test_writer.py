@@ -1,7 +1,5 @@
 """The written files against the facts known of VHAP's export."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

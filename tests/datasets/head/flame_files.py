@@ -4,8 +4,6 @@ The genuine files were written by Python 2: byte strings are text, modules have 
 may hide in chumpy objects. `legacy_pickle` writes such a stream from today's objects.
 """
 
-from __future__ import annotations
-
 import pickle
 import struct
 import sys

@@ -4,8 +4,6 @@ As in the real ``FLAME_masks.pkl`` the lips are a band of eight rows of vertices
 face, too; behind them lies a wall that is in no mask and ends in a hole.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -143,19 +143,8 @@ def test_the_neck_moves_the_head_and_not_the_shoulders(head, model, joints):
 
 def test_regions(head):
     regions = {name: set(members.tolist()) for name, members in head.regions.items()}
-    for name in (
-        "face",
-        "eye_region",
-        "lips",
-        "scalp",
-        "neck",
-        "left_ear",
-        "teeth_upper",
-        "hair",
-        "skin",
-        "nose",
-    ):
-        assert regions[name], name
+    names = ("face", "eye_region", "lips", "scalp", "neck", "left_ear", "teeth_upper", "hair", "skin", "nose")
+    assert all(regions[name] for name in names)
     assert not regions["face"] & (regions["neck"] | regions["left_ear"] | regions["right_ear"])
     assert regions["eye_region"] | regions["forehead"] <= regions["face"]
     assert regions["teeth_upper"] | regions["teeth_lower"] == regions["teeth"]

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
 from headbench.datasets.head.model import HeadModel
 
 from .flame_files import flame_content
+from .skinning import skinned
 from .toy import toy_head
 
 HEAD = toy_head(16, eyelids=True)
@@ -22,41 +22,12 @@ SIZES = {"shape": 6, "expression": 8, "rotation": 3, "neck": 3, "jaw": 3, "eyes"
 
 def zeros(**given_values):
     values = {name: torch.zeros(size, dtype=torch.float64) for name, size in SIZES.items()}
-    return values | {
-        name: torch.as_tensor(value, dtype=torch.float64) for name, value in given_values.items()
-    }
+    return values | {name: torch.as_tensor(value).double() for name, value in given_values.items()}
 
 
 def random_arguments(batch=3, seed=0, sizes=SIZES, dtype=torch.float64):
     generator = torch.Generator().manual_seed(seed)
     return {name: torch.randn(batch, size, generator=generator, dtype=dtype) for name, size in sizes.items()}
-
-
-def loop_reference(head, one, offset=None, eyelids=None):
-    """Vertices of one pose, vertex by vertex, with 4x4 matrices (float64)."""
-    one = {name: value.double().numpy() for name, value in one.items()}
-    shaped = head.template + head.shape_basis @ one["shape"] + head.expression_basis @ one["expression"]
-    shaped = shaped + (0 if offset is None else offset)
-    joints = head.joint_regressor @ shaped
-    pose = [one["rotation"], one["neck"], one["jaw"], one["eyes"][:3], one["eyes"][3:]]
-    turns = [Rotation.from_rotvec(vector).as_matrix() for vector in pose]
-    world: list[np.ndarray] = []
-    for joint, parent in enumerate(head.parents):
-        about = np.eye(4)
-        about[:3, :3] = turns[joint]
-        about[:3, 3] = joints[joint] - turns[joint] @ joints[joint]
-        world.append(about if parent < 0 else world[parent] @ about)
-    result = np.empty_like(shaped)
-    for vertex in range(len(shaped)):
-        place = shaped[vertex].copy()
-        for joint in range(1, 5):
-            for row in range(3):
-                for column in range(3):
-                    amount = turns[joint][row, column] - (row == column)
-                    place += amount * head.pose_basis[vertex, :, 9 * (joint - 1) + 3 * row + column]
-        blended = sum(head.skinning_weights[vertex, joint] * world[joint] for joint in range(5))
-        result[vertex] = (blended @ np.append(place, 1))[:3] + one["translation"]
-    return result if eyelids is None else result + (head.eyelid_basis @ eyelids) @ (turns[0] @ turns[1]).T
 
 
 def test_agrees_with_smplx(tmp_path):
@@ -93,8 +64,8 @@ def test_agrees_with_a_loop(head):
     eyelids = torch.randn(3, 2, dtype=torch.float64)
     ours = HeadModel(head, dtype=torch.float64)(**a, static_offset=offset, eyelids=eyelids)
     for index in range(3):
-        one = {name: value[index] for name, value in a.items()}
-        expected = loop_reference(head, one, offset.numpy(), eyelids[index].numpy())
+        one = {name: value[index].numpy() for name, value in (a | {"eyelids": eyelids}).items()}
+        expected = skinned(head, offset=offset.numpy(), **one)
         np.testing.assert_allclose(ours[index], expected, atol=1e-13)
 
 

@@ -3,28 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.head import rotations
 from headbench.datasets.head.rotations import matrices_and_derivatives
 
 AXES = np.concatenate([np.eye(3), -np.eye(3), Rotation.random(20, random_state=0).apply([0.0, 0.0, 1.0])])
-ANGLES = (
-    0.0,
-    1e-12,
-    1e-7,
-    1e-4,
-    0.03,
-    0.06,
-    0.07,
-    0.19,
-    0.21,
-    1.0,
-    2.5,
-    *(np.pi - np.array([1e-3, 1e-7, 1e-12])),
-)
+SMALL = (0.0, 1e-12, 1e-7, 1e-4, 0.03, 0.06, 0.07, 0.19, 0.21)
+ANGLES = (*SMALL, 1.0, 2.5, *(np.pi - np.array([1e-3, 1e-7, 1e-12])))
 VECTORS = np.concatenate([AXES * angle for angle in ANGLES])
 
 
@@ -104,15 +90,6 @@ def test_gradients_are_finite_everywhere(dtype):
     zero = torch.zeros(4, dtype=dtype, requires_grad=True)
     assert gradient_is_finite(rotations.quaternion_to_matrix(zero), zero)
     assert gradient_is_finite(rotations.quaternion_to_axis_angle(zero), zero)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.floats(-4, 4), min_size=3, max_size=3))
-def test_matrices_are_rotations(vector):
-    matrix = rotations.axis_angle_to_matrix(torch.tensor(vector, dtype=torch.float64))
-    close(matrix @ matrix.T, np.eye(3), atol=1e-13)
-    close(torch.linalg.det(matrix), 1, atol=1e-13)
-    close(matrix @ torch.tensor(vector, dtype=torch.float64), vector, atol=1e-13)
 
 
 DIAGONAL = np.ones(3) / np.sqrt(3)

@@ -1,7 +1,5 @@
 """A small random head in FLAME's layout for tests: everything a real one has, in a few hundred vertices."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from headbench.datasets.head.arrays import HeadArrays
@@ -20,19 +18,11 @@ def toy_head(
     version: str = "toy",
     dtype: type = np.float64,
 ) -> HeadArrays:
-    """Make a closed low-poly head with a mouth pocket, two eyeballs, lips, regions and random smooth bases.
+    """Make a closed head with a mouth pocket, eyeballs, lips, regions and random smooth bases, V = 13 n + 2 + 2 (2 n + 2).
 
-    Parameters
-    ----------
-    n : vertices around the head (a multiple of 8, at least 16); V = 13 n + 2 + 2 (2 n + 2).
-    seed : of the random bases.
-    shape_size, expression_size : S and E.
-    eyelids : whether there is an eyelid basis.
-
-    The head is about 0.2 m high, +y up, +z front, +x the subject's left, near the origin.
+    ``n`` (a multiple of 8, at least 16) are the vertices around it; it is about 0.2 m high, near the origin, +y up,
+    +z front, +x the subject's left.
     """
-    if n < 16 or n % 8:
-        raise ValueError(f"n: expected a multiple of 8, at least 16, found {n}")
     rng = np.random.default_rng(seed)
     skin, skin_faces = _sphere(_LATITUDES, n)
     front = np.arange(n) * 2 * np.pi / n  # 0 is straight ahead

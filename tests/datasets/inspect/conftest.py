@@ -1,7 +1,5 @@
 """A capture to inspect."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

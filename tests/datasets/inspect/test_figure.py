@@ -1,7 +1,5 @@
 """The parts of the picture: cameras on their side, outlines on silhouettes, choices of what to show."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
@@ -19,14 +17,8 @@ from headbench.datasets.inspect.figure import (
     overlay,
     pick_cameras,
     pick_timesteps,
-    space_summary,
 )
-from headbench.datasets.inspect.statistics import (
-    ExpressionSpace,
-    expression_space,
-    sequence_rows,
-    split_rows,
-)
+from headbench.datasets.inspect.statistics import expression_space, sequence_rows, split_rows
 
 from ..lint.good_capture import FRONTAL
 from ..tiny_capture import look_at
@@ -127,12 +119,3 @@ def test_a_clip_with_holes_and_without_tests_is_drawn(clip):
     )
     assert picture.shape[1] == WIDTH * DPI
     assert len(np.argwhere((picture == 238).all(axis=2))) > 500, "the missing frame is a grey field"
-
-
-@pytest.mark.parametrize(
-    ("explained", "begins"),
-    [((0.97, 0.03), "1 component explains 95%"), ((0.8, 0.2), "2 components explain 95%")],
-)
-def test_the_summary_counts_in_singular_and_plural(explained, begins):
-    space = ExpressionSpace([0], np.zeros(1, bool), np.zeros((1, 2)), np.array(explained), {}, {})
-    assert space_summary(space).startswith(begins)

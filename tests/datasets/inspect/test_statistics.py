@@ -1,7 +1,5 @@
 """Statistics against scipy's rotations and an explicit PCA over vertices."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

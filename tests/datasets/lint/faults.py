@@ -1,4 +1,4 @@
-"""Faults to plant into a good capture: the code that must find each, and codes that may speak up with it."""
+"""Faults to plant into good captures: the code that must find each, and codes that may speak up with it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ Plant = Callable[[GoodCapture], None]
 class Fault:
     """``code`` must be found; beside it only ``companions`` may be."""
 
-    name: str
     code: str
     plant: Plant
     companions: tuple[str, ...] = ()
@@ -79,6 +78,15 @@ def _orphan(good):
 def _orphan_jpeg(good):
     path = good.files("images")[0]
     cv2.imwrite(str(path.with_suffix(".jpg")), read_rgb(path))
+
+
+def _small_mask(good):
+    write_pixels(good.files("fg_masks")[7], np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8))
+
+
+def _one_later(value):
+    for frame in value["frames"]:
+        frame["timestep_index"] += 1
 
 
 def _absolute(frame):
@@ -264,117 +272,116 @@ def _shrink(good):
     good.each_parameters(lambda a, i: a.update(static_offset=a["static_offset"] - 0.7 * template))
 
 
-FAULTS = (
-    Fault(
-        "camera id changes",
-        "HB100",
-        _edit(TRAIN, lambda v: v["frames"][4].update(camera_id="elsewhere")),
-        ("HB502",),
+CAPTURES = (
+    (
+        Fault("HB507", _set_all(cx=2.0), ("HB510", "HB701", "HB702")),
+        Fault("HB100", _edit(TRAIN, lambda v: v["frames"][4].update(camera_id="x")), ("HB502",)),
+        Fault("HB105", _edit(TRAIN, lambda v: v["frames"].pop(5)), ("HB113",)),
+        Fault("HB601", _declare(head_model="flame2020"), ("HB100", "HB613")),
+        Fault("HB103", lambda good: good.files("flame_param")[4].write_bytes(b"PK\x03\x04")),
+        Fault("HB107", _freeze),
     ),
-    Fault("JSON cut off", "HB101", _cut_json),
-    Fault(
-        "frame without its image's name",
-        "HB102",
-        _edit(TRAIN, lambda v: v["frames"][3].pop("file_path")),
+    (
+        Fault("HB108", _declare(excluded={99: "tongue out"}), REFUSED),
+        Fault("HB111", _edit(VAL, lambda v: v.update(frames=[])), ("HB113",)),
+        Fault("HB502", _same_camera, ("HB702",)),
+        Fault("HB114", _edit(TRAIN, lambda v: v["frames"][2].pop("fg_mask_path") and None)),
+        Fault("HB201", _copy_to_test, ("HB702",)),
+        Fault("HB203", _move(TEST, 4)),
     ),
-    Fault("image deleted", "HB103", lambda good: _test_images(good, 2)[1].unlink()),
-    Fault("image cut off", "HB103", _cut_image),
-    Fault(
-        "parameters damaged",
-        "HB103",
-        lambda good: good.files("flame_param")[4].write_bytes(b"PK\x03\x04 no archive"),
-    ),
-    Fault(
-        "mask of another size",
-        "HB104",
-        lambda good: write_pixels(
-            good.files("fg_masks")[7], np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8)
+    (
+        Fault("HB205", _edit(TRAIN, lambda v: v["frames"].append(v["frames"][0])), REFUSED),
+        Fault(
+            "HB608",
+            _parameters(lambda a, i: a.update(expr=15 * a["expr"])),
+            ("HB701", "HB702", "HB612", "HB615"),
         ),
+        Fault("HB109", _declare(excluded={3: " "})),
+        Fault("HB113", _orphan),
+        Fault("HB202", _nearly_copy_to_test),
+        Fault("HB204", _move(VAL, 6)),
     ),
-    Fault("frame left out", "HB105", _edit(TRAIN, lambda v: v["frames"].pop(5)), ("HB113",)),
-    Fault(
-        "gap in timesteps",
-        "HB106",
-        _edit(
-            TEST, lambda v: [f.update(timestep_index=f["timestep_index"] + 1) for f in v["frames"]] and None
+    (
+        Fault(
+            "HB506",
+            _each(lambda f: f.update(fl_x=2 * f["fl_x"], fl_y=2 * f["fl_y"])),
+            ("HB100", "HB701", "HB702"),
         ),
-        REFUSED,
+        Fault("HB512", _nudge_one_frame, REFUSED),
+        Fault("HB110", _declare(excluded={12: "tongue out", 13: "tongue out"})),
+        Fault("HB113", _orphan_jpeg),
+        Fault("HB301", _declare(background=(0.0, 0.0, 0.0))),
+        Fault("HB304", _flat_mask(0)),
     ),
-    Fault("frozen images", "HB107", _freeze),
-    Fault("exclusion of nothing", "HB108", _declare(excluded={99: "tongue out"}), REFUSED),
-    Fault("exclusion without reason", "HB109", _declare(excluded={3: " "})),
-    Fault("short test", "HB110", _declare(excluded={12: "tongue out", 13: "tongue out"})),
-    Fault("empty split", "HB111", _edit(VAL, lambda v: v.update(frames=[])), ("HB113",)),
-    Fault("no declaration", "HB112", lambda good: (good.union / "headbench.json").unlink()),
-    Fault("orphan", "HB113", _orphan),
-    Fault("orphan of another format", "HB113", _orphan_jpeg),
-    Fault("absolute paths", "HB116", _each(_absolute), ("HB602",)),
-    Fault("one mask less", "HB114", _edit(TRAIN, lambda v: v["frames"][2].pop("fg_mask_path") and None)),
-    Fault("image copied to the test", "HB201", _copy_to_test, ("HB702",)),
-    Fault("image nearly copied to the test", "HB202", _nearly_copy_to_test),
-    Fault("test frame in training", "HB203", _move(TEST, 4)),
-    Fault("novel view in training", "HB204", _move(VAL, 6)),
-    Fault("entry repeated", "HB205", _edit(TRAIN, lambda v: v["frames"].append(v["frames"][0])), REFUSED),
-    Fault("black declared", "HB301", _declare(background=(0.0, 0.0, 0.0))),
-    Fault("soiled background", "HB302", _images(_soil)),
-    Fault("premultiplied twice", "HB303", _images(_premultiply_again)),
-    Fault("never premultiplied", "HB303", _images(_never_multiplied)),
-    Fault("empty masks", "HB304", _flat_mask(0)),
-    Fault("full masks", "HB305", _flat_mask(255)),
-    Fault("inverted masks", "HB306", _masks(lambda image, mask: 255 - mask)),
-    Fault("masks of 0 and 1", "HB307", _masks(lambda image, mask: mask // 255)),
-    Fault("blank images", "HB308", _blank),
-    Fault("limited range", "HB401", _images(_limited)),
-    Fault("limited range on white", "HB401", _images(_limited_subject)),
-    Fault("levels of 0 and 1", "HB402", _images(lambda image, mask: image // 255)),
-    Fault("grey", "HB403", _images(_grey)),
-    Fault("BGR", "HB404", _images(lambda image, mask: image[..., ::-1])),
-    Fault("one camera tinted", "HB405", _tint_one_camera),
-    Fault("JPEG", "HB406", _jpeg),
-    Fault("JPEG named PNG", "HB406", _jpeg_as_png),
-    Fault(
-        "stretched rotation",
-        "HB501",
-        _edit(TRAIN, lambda v: _matrix(lambda m: m * np.array([2.0, 2, 2, 1]))(v["frames"][4])),
-        REFUSED,
+    (
+        Fault("HB612", _one(15, _jump), ("HB702",)),
+        Fault("HB101", _cut_json),
+        Fault("HB102", _edit(TRAIN, lambda v: v["frames"][3].pop("file_path"))),
+        Fault("HB103", lambda good: _test_images(good, 2)[1].unlink()),
+        Fault("HB104", _small_mask),
+        Fault("HB106", _edit(TEST, _one_later), REFUSED),
     ),
-    Fault("same camera twice", "HB502", _same_camera, ("HB702",)),
-    Fault("OpenCV axes", "HB503", _matrices(lambda m: m * np.array([1, -1, -1, 1.0]))),
-    Fault("upside down", "HB504", _matrices(lambda m: m * np.array([-1, -1, 1, 1.0]))),
-    Fault("millimetres", "HB505", _matrices(_millimetres)),
-    Fault(
-        "focal length of twice the size",
-        "HB506",
-        _each(lambda f: f.update(fl_x=2 * f["fl_x"], fl_y=2 * f["fl_y"])),
-        ("HB100", "HB701", "HB702"),
+    (
+        Fault("HB103", _cut_image),
+        Fault("HB112", lambda good: (good.union / "headbench.json").unlink()),
+        Fault("HB305", _flat_mask(255)),
+        Fault("HB308", _blank),
+        Fault(
+            "HB501",
+            _edit(TRAIN, lambda v: _matrix(lambda m: m * np.array([2.0, 2, 2, 1]))(v["frames"][4])),
+            REFUSED,
+        ),
+        Fault("HB503", _matrices(lambda m: m * np.array([1, -1, -1, 1.0]))),
     ),
-    Fault("principal point of another size", "HB507", _set_all(cx=2.0), ("HB510", "HB701", "HB702")),
-    Fault("half a pixel", "HB508", _set_all(cx=(WIDTH - 1) / 2, cy=(HEIGHT - 1) / 2)),
-    Fault("principal point dropped", "HB509", _declare(cy="centre")),
-    Fault("camera moves", "HB512", _nudge_one_frame, REFUSED),
-    Fault("other version declared", "HB601", _declare(head_model="flame2020"), ("HB100", "HB613")),
-    Fault("no head", "HB602", lambda good: (good.union / "head_model.npz").unlink()),
-    Fault("too many coefficients", "HB603", _one(5, lambda a: a.update(expr=np.zeros((1, 99)))), REFUSED),
-    Fault("NaN", "HB604", _one(5, lambda a: a["expr"].fill(np.nan)), REFUSED),
-    Fault("few coefficients", "HB605", _parameters(lambda a, i: a.update(expr=a["expr"][:, :5]))),
-    Fault("eyelids", "HB606", _parameters(lambda a, i: a.update(eyelids=np.full((1, 2), 0.3)))),
-    Fault("jaw at rest", "HB607", _parameters(lambda a, i: a["jaw_pose"].fill(0.0))),
-    Fault(
-        "huge expressions",
-        "HB608",
-        _parameters(lambda a, i: a.update(expr=15 * a["expr"])),
-        ("HB701", "HB702", "HB612", "HB615"),
+    (
+        Fault("HB116", _each(_absolute), ("HB602",)),
+        Fault("HB602", lambda good: (good.union / "head_model.npz").unlink()),
     ),
-    Fault("identity changes", "HB609", _one(8, lambda a: a["shape"].__iadd__(0.01))),
-    Fault(
-        "dynamic offset", "HB610", _one(8, lambda a: a.update(dynamic_offset=a["static_offset"] * 0 + 1e-3))
+    (
+        Fault("HB302", _images(_soil)),
+        Fault("HB403", _images(_grey)),
+        Fault("HB406", _jpeg),
+        Fault("HB504", _matrices(lambda m: m * np.array([-1, -1, 1, 1.0]))),
+        Fault("HB505", _matrices(_millimetres)),
+        Fault("HB508", _set_all(cx=(WIDTH - 1) / 2, cy=(HEIGHT - 1) / 2)),
     ),
-    Fault("parameters repeated", "HB611", _repeat_parameters),
-    Fault("tracking jumps", "HB612", _one(15, _jump), ("HB702",)),
-    Fault("sequence of another version", "HB613", _sequence_version),
-    Fault("expression at rest", "HB614", _parameters(lambda a, i: a["expr"].fill(0.0))),
-    Fault("untrained test", "HB616", _far_test, ("HB701", "HB702", "HB612", "HB615")),
-    Fault("mesh aside", "HB701", _parameters(lambda a, i: a["translation"].__iadd__(0.04))),
-    Fault("one camera aside", "HB702", _shift_one_camera),
-    Fault("small mesh", "HB703", _shrink),
+    (
+        Fault("HB303", _images(_premultiply_again)),
+        Fault("HB401", _images(_limited_subject)),
+        Fault("HB404", _images(lambda image, mask: image[..., ::-1])),
+        Fault("HB509", _declare(cy="centre")),
+        Fault("HB603", _one(5, lambda a: a.update(expr=np.zeros((1, 99)))), REFUSED),
+        Fault("HB606", _parameters(lambda a, i: a.update(eyelids=np.full((1, 2), 0.3)))),
+    ),
+    (
+        Fault("HB303", _images(_never_multiplied)),
+        Fault("HB406", _jpeg_as_png),
+        Fault("HB604", _one(5, lambda a: a["expr"].fill(np.nan)), REFUSED),
+        Fault("HB605", _parameters(lambda a, i: a.update(expr=a["expr"][:, :5]))),
+        Fault("HB607", _parameters(lambda a, i: a["jaw_pose"].fill(0.0))),
+        Fault("HB609", _one(8, lambda a: a["shape"].__iadd__(0.01))),
+    ),
+    (
+        Fault("HB306", _masks(lambda image, mask: 255 - mask)),
+        Fault("HB610", _one(8, lambda a: a.update(dynamic_offset=a["static_offset"] * 0 + 1e-3))),
+        Fault("HB611", _repeat_parameters),
+        Fault("HB613", _sequence_version),
+        Fault("HB614", _parameters(lambda a, i: a["expr"].fill(0.0))),
+    ),
+    (
+        Fault("HB307", _masks(lambda image, mask: mask // 255)),
+        Fault("HB616", _far_test, ("HB701", "HB702", "HB612", "HB615")),
+    ),
+    (
+        Fault("HB401", _images(_limited)),
+        Fault("HB701", _parameters(lambda a, i: a["translation"].__iadd__(0.04))),
+    ),
+    (Fault("HB402", _images(lambda image, mask: image // 255)),),
+    (
+        Fault("HB405", _tint_one_camera),
+        Fault("HB702", _shift_one_camera),
+        Fault("HB703", _shrink),
+    ),
 )
+"""Faults that are planted together into one capture, as they do not hide one another."""
+FAULTS = tuple(fault for planted in CAPTURES for fault in planted)

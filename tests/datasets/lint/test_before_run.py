@@ -14,7 +14,7 @@ def test_a_good_capture_may_be_trained_on(pristine):
     assert errors(read_capture(pristine.union)) == []
 
 
-@pytest.mark.parametrize("fault", VOID, ids=lambda fault: fault.name)
+@pytest.mark.parametrize("fault", VOID, ids=lambda fault: fault.code)
 def test_a_capture_that_shows_no_head_may_not(good, fault):
     fault.plant(good)
     found = errors(read_capture(good.union, cy="bottom"))

@@ -20,9 +20,7 @@ from headbench.datasets.synthetic.capture import synthesize
 
 
 def _exclude(capture, excluded):
-    declaration = Declaration.read(capture.union)
-    assert declaration is not None
-    replace(declaration, excluded=excluded).write(capture.union)
+    replace(Declaration.read(capture.union), excluded=excluded).write(capture.union)
 
 
 def test_clean_warning_and_strict(good):

@@ -1,7 +1,5 @@
 """Files of INSTA's and IMavatar's layouts, written from one camera of a capture by the formulae of their own scripts."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -72,13 +70,7 @@ def recording_of(
 def write_insta(
     recording: Recording, folder: Path, *, test: int = 0, parameters: Sequence[str] = ("exp", "eyes", "jaw")
 ) -> Path:
-    """INSTA's folder as ``generate.sh`` leaves it.
-
-    Parameters
-    ----------
-    test : frames of ``transforms_test.json``; 0 writes ``transforms.json`` alone.
-    parameters : of ``flame/``; the script of today writes "exp" alone.
-    """
+    """INSTA's folder as ``generate.sh`` leaves it, ``test`` frames in a JSON of their own; today's writes "exp" alone."""
     for name in ("images", "meshes", *(f"flame/{name}" for name in parameters)):
         (folder / name).mkdir(parents=True)
     head, subject, camera = recording.head, recording.subject, recording.camera
@@ -110,19 +102,9 @@ def write_insta(
         )
     width, height, K = camera.width, camera.height, camera.K
     angles = [2 * np.arctan(size / (2 * focal)) for size, focal in ((width, K[0, 0]), (height, K[1, 1]))]
-    document = {
-        "w": float(width),
-        "h": float(height),
-        "fl_x": K[0, 0],
-        "fl_y": K[1, 1],
-        "cx": K[0, 2],
-        "cy": K[1, 2],
-        "camera_angle_x": angles[0],
-        "camera_angle_y": angles[1],
-        "x_fov": np.degrees(angles[0]),
-        "y_fov": np.degrees(angles[1]),
-        "integer_depth_scale": 0.001,
-    }
+    names = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+    values = [float(width), float(height), K[0, 0], K[1, 1], *K[:2, 2], *angles, *np.degrees(angles)]
+    document = dict(zip(names, values)) | {"integer_depth_scale": 0.001}
     parts = {"": frames}
     if test:
         parts |= {"_train": frames[:-test], "_test": frames[-test:], "_val": frames[-2:]}

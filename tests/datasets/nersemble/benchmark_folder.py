@@ -1,7 +1,5 @@
 """The benchmark's folder in small: calibration and tracking of one participant, random but right."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -32,15 +30,13 @@ def tracking(head: HeadArrays, frames: int, seed: int = 0) -> dict[str, np.ndarr
     return {name: values.astype(np.float32) for name, values in draw.items()} | {"frames": np.arange(frames)}
 
 
-def write_benchmark(
-    root: Path, head: HeadArrays, participant: str = "393", frames: int = 2, focal: float = 1500.0
-) -> Path:
-    """Write cameras and tracking of a participant; return the benchmark's folder."""
-    home = root / MONO.name / participant
-    for number, sequence in enumerate(MONO.sequences[participant]):
+def write_benchmark(root: Path, head: HeadArrays) -> Path:
+    """Write cameras and tracking, two frames a sequence, of participant 393; return the benchmark's folder."""
+    home = root / MONO.name / "393"
+    for number, sequence in enumerate(MONO.sequences["393"]):
         folder = home / "sequences" / sequence / "tracking"
         folder.mkdir(parents=True)
-        np.savez(folder / TRACKING_FILE, **tracking(head, frames, number))
+        np.savez(folder / TRACKING_FILE, **tracking(head, 2, number))
     turns = Rotation.from_rotvec([[0, turn, 0] for turn in (0.0, -0.5, 0.1, 0.5)]).as_matrix()
     turns = turns * np.array(
         [[1.0], [-1.0], [-1.0]]
@@ -50,7 +46,7 @@ def write_benchmark(
         matrix = np.eye(4)
         matrix[:3, :3], matrix[2, 3] = turn, SCALE
         matrices[serial] = matrix.tolist()
-    K = [[focal, 0, 250.0], [0, focal, 260.0], [0, 0, 1]]
+    K = [[1500.0, 0, 250.0], [0, 1500.0, 260.0], [0, 0, 1]]
     (home / "calibration").mkdir()
     document = {"world_2_cam": matrices, "intrinsics": dict.fromkeys(MONO.serials, K)}
     (home / "calibration" / "camera_params.json").write_text(json.dumps(document))

@@ -1,7 +1,5 @@
 """Recordings that tests share, and copies that a test may damage."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

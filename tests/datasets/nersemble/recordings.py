@@ -1,7 +1,5 @@
 """Raw recordings in the layouts of NeRSemble's releases, with VHAP's tracking of them: every frame tells its camera and number."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -157,9 +155,9 @@ def write_tracked(path: Path, arrays: dict[str, np.ndarray]) -> None:
     np.savez(path, **values, n_processed_frames=np.array(count))
 
 
-def tracked_arrays(head: HeadArrays, count: int, seed: int = 0) -> dict[str, np.ndarray]:
+def tracked_arrays(head: HeadArrays, count: int) -> dict[str, np.ndarray]:
     """VHAP's arrays with random numbers."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     vertices, _, identities = head.shape_basis.shape
     sizes = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
     arrays = {key: 0.05 * rng.normal(size=(count, size)) for key, size in sizes.items()}

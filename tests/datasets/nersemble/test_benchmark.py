@@ -31,8 +31,6 @@ from ..tiny_capture import edit_json
 from .benchmark_folder import SCALE, tracking, write_benchmark
 from .recordings import write_video
 
-# Tracking
-
 
 @pytest.fixture(scope="module")
 def head():
@@ -67,41 +65,32 @@ def test_tracking_gives_the_benchmarks_meshes_and_pictures(head, benchmark):
     assert {(camera.width, camera.height) for camera in sequence.cameras.values()} == {(512, 512)}
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (
-            {"rotation": np.full((2, 3), 0.5, np.float32)},
-            "rotation_matrices: expected the matrices of the angles",
-        ),
-        ({"expression": np.zeros((2, 99), np.float32)}, "expression: expected at most the 8 coefficients"),
-        ({"scale": np.zeros((1, 1), np.float32)}, "scale"),
-        ({"jaw": np.zeros((3, 3), np.float32)}, "jaw"),
-        ({"eyes": np.full((2, 6), np.nan, np.float32)}, "eyes"),
-    ],
-)
-def test_tracking_that_does_not_fit_is_refused(head, benchmark, change, says):
+BAD_TRACKING = {
+    "rotation_matrices": {"rotation": np.full((2, 3), 0.5, np.float32)},
+    "expression": {"expression": np.zeros((2, 99), np.float32)},
+    "scale": {"scale": np.zeros((1, 1), np.float32)},
+    "jaw": {"jaw": np.zeros((3, 3), np.float32)},
+    "eyes": {"eyes": np.full((2, 6), np.nan, np.float32)},
+}
+
+
+@pytest.mark.parametrize("key", BAD_TRACKING)
+def test_tracking_that_does_not_fit_is_refused(head, benchmark, key):
     path = tracking_file(benchmark, "393", "FREE")
-    np.savez(path, **(tracking(head, 2) | change))
-    with pytest.raises(InputError, match=says):
+    np.savez(path, **(tracking(head, 2) | BAD_TRACKING[key]))
+    with pytest.raises(InputError, match=key):
         read_sequence(benchmark, MONO, "393", "FREE", head)
 
 
-def test_tracking_of_version_1_is_refused(head, benchmark):
+def test_missing_cameras_and_version_1_are_refused(head, benchmark):
+    cameras = benchmark / MONO.name / "393" / "calibration" / "camera_params.json"
+    edit_json(cameras, lambda document: document["world_2_cam"].pop("220700191"))
     path = tracking_file(benchmark, "393", "FREE")
-    path.rename(path.with_name("flame2023_tracking.npz"))
-    with pytest.raises(InputError, match="version 1, which is no longer taken.*nersemble-benchmark-download"):
-        read_sequence(benchmark, MONO, "393", "FREE", head)
-
-
-def test_a_missing_camera_is_named(head, benchmark):
-    path = benchmark / MONO.name / "393" / "calibration" / "camera_params.json"
-    edit_json(path, lambda document: document["world_2_cam"].pop("220700191"))
-    with pytest.raises(InputError, match="no 220700191"):
-        read_sequence(benchmark, MONO, "393", "FREE", head)
-
-
-# Submissions
+    for message in ("220700191", "version 1"):
+        with pytest.raises(InputError, match=message):
+            read_sequence(benchmark, MONO, "393", "FREE", head)
+        if path.exists():
+            path.rename(path.with_name("flame2023_tracking.npz"))
 
 
 def test_files_are_those_of_the_documentation():
@@ -178,73 +167,46 @@ def written(frames, out, **others):
     return submission_write(SubmissionWriteSettings(str(frames), str(out), MONO.name, **others), no_progress)
 
 
-@pytest.mark.parametrize("layout", ["", "ours/seed-0/renders/self_reenactment"])
-def test_what_is_written_passes_the_check(track, frames, ffmpeg, tmp_path, layout, capsys):
-    """Of a folder, and of a run."""
+def test_what_is_written_passes_the_check(track, frames, ffmpeg, tmp_path, capsys):
+    """Of a folder, and the same of a run."""
     words = ffmpeg()
-    if layout:
-        target = tmp_path / "run" / "393" / layout
-        target.parent.mkdir(parents=True)
-        (frames / "393").rename(target)
-        frames = tmp_path / "run"
     out = tmp_path / "out.zip"
     findings = written(frames, out)
-    assert "-crf 14" in words.read_text()
-    assert "-vcodec libx264 -pix_fmt yuv420p" in words.read_text()
-    assert "-r 24.3" in words.read_text()
+    for expected in ("-crf 14", "-vcodec libx264 -pix_fmt yuv420p", "-r 24.3"):
+        assert expected in words.read_text()
     with zipfile.ZipFile(out) as archive:
         assert set(archive.namelist()) == {video.name for video in track.videos()}
         assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
     assert min(video["psnr"] for video in findings.data["videos"]) > 30
     assert cli.main(["submission", "check", str(out)]) == 0
     assert "Nothing that the server would refuse" in capsys.readouterr().out
-    if not layout:
-        first = out.read_bytes()
-        written(frames, out)
-        assert out.read_bytes() == first
+    target = tmp_path / "run/393/ours/seed-0/renders/self_reenactment"
+    target.parent.mkdir(parents=True)
+    (frames / "393").rename(target)
+    written(tmp_path / "run", tmp_path / "again.zip")
+    assert (tmp_path / "again.zip").read_bytes() == out.read_bytes()
 
 
-def missing(frames):
-    for path in (frames / "393").glob("FREE_*_222200046.png"):
-        path.unlink()
+def removed(pattern):
+    return lambda home: [path.unlink() for path in home.glob(pattern)]
 
 
-def gap(frames):
-    (frames / "393" / "FREE_00001_222200046.png").unlink()
+LARGER = np.zeros((50, 32, 3), np.uint8)
+RENDERS = "seed-0/renders/novel_view"
+DAMAGE = {
+    "none for 1": removed("FREE_*_222200046.png"),
+    "none of timestep 1": removed("FREE_00001_222200046.png"),
+    "6 frames": removed("FREE_00002_*.png"),
+    "2, 3": removed("FREE_00002_222200046.png"),
+    "32x50": lambda home: write_png(home / "FREE_00001_222200046.png", LARGER),
+    "--method": lambda home: [(home / name / RENDERS).mkdir(parents=True) for name in ("ga", "ours")],
+}
 
 
-def short(frames):
-    for path in (frames / "393").glob("FREE_00002_*.png"):
-        path.unlink()
-
-
-def uneven(frames):
-    (frames / "393" / "FREE_00002_222200046.png").unlink()
-
-
-def larger(frames):
-    write_png(frames / "393" / "FREE_00001_222200046.png", np.zeros((50, 32, 3), np.uint8))
-
-
-def two_methods(frames):
-    for name in ("ga", "ours"):
-        (frames / "393" / name / "seed-0" / "renders" / "novel_view").mkdir(parents=True)
-
-
-@pytest.mark.parametrize(
-    ("damage", "says"),
-    [
-        (missing, "none for 1 of them"),
-        (gap, "without a gap, found none of timestep 1"),
-        (short, "393: expected 6 frames in all sequences together"),
-        (uneven, "as many frames from every camera, found 2, 3"),
-        (larger, "RGB of 32x48 pixels, the size of this track, found 32x50"),
-        (two_methods, "--method.*ga seed-0, ours seed-0"),
-    ],
-)
-def test_frames_that_would_be_refused_are_not_encoded(frames, ffmpeg, tmp_path, damage, says):
+@pytest.mark.parametrize("says", DAMAGE)
+def test_frames_that_would_be_refused_are_not_encoded(frames, ffmpeg, tmp_path, says):
     words = ffmpeg()
-    damage(frames)
+    DAMAGE[says](frames / "393")
     with pytest.raises(InputError, match=says):
         written(frames, tmp_path / "out.zip")
     assert not words.exists()
@@ -254,7 +216,7 @@ def test_frames_that_would_be_refused_are_not_encoded(frames, ffmpeg, tmp_path, 
 def test_tracking_tells_how_many_frames_there_are(frames, ffmpeg, head, tmp_path):
     ffmpeg()
     with pytest.raises(InputError, match="FREE, camera 222200037: expected 2 frames, found 3"):
-        written(frames, tmp_path / "out.zip", data=str(write_benchmark(tmp_path / "data", head, frames=2)))
+        written(frames, tmp_path / "out.zip", data=str(write_benchmark(tmp_path / "data", head)))
 
 
 def test_without_the_encoder_it_says_where_to_get_it(frames, tmp_path, monkeypatch, capsys):
@@ -273,51 +235,42 @@ def test_an_encoder_that_fails_is_quoted(frames, ffmpeg, tmp_path):
     assert not (tmp_path / "out.zip").exists()
 
 
-def encoded(tmp_path, size=SIZE, count=FRAMES):
-    path = tmp_path / f"{size[0]}-{count}.mp4"
-    write_video(path, [np.full((size[1], size[0], 3), 80, np.uint8)] * count, MONO.fps)
-    return path.read_bytes()
+FIRST = "393/FREE/cam_222200037.mp4"
+WRONG = {
+    FIRST: lambda files, make: files.pop(FIRST),
+    "no video": lambda files, make: files.update({FIRST: b"junk"}),
+    "no video|decoded": lambda files, make: files.update({FIRST: make()[:-900]}),
+    "48x32": lambda files, make: files.update({FIRST: make((48, 32))}),
+    "every camera": lambda files, make: files.update({FIRST: make(count=2)}),
+    "6 frames": lambda files, make: files.update(dict.fromkeys(files, make(count=2))),
+}
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (lambda files, make: None, ""),
-        (lambda files, make: files.pop(next(iter(files))), r"393/FREE/cam_222200037.mp4: missing"),
-        (lambda files, make: files.update({next(iter(files)): b"junk"}), "no video"),
-        (lambda files, make: files.update({next(iter(files)): make()[:-900]}), "no video|can be decoded"),
-        (lambda files, make: files.update({next(iter(files)): make((48, 32))}), "48x32 pixels, 32x48 are"),
-        (
-            lambda files, make: files.update({next(iter(files)): make(count=2)}),
-            "as many frames from every camera",
-        ),
-        (lambda files, make: files.update(dict.fromkeys(files, make(count=2))), "6 frames in all sequences"),
-    ],
-)
-def test_what_the_server_would_refuse_is_named(track, tmp_path, change, says):
+@pytest.mark.parametrize("says", ["", *WRONG])
+def test_what_the_server_would_refuse_is_named(track, tmp_path, says):
     def make(size=SIZE, count=FRAMES):
-        return encoded(tmp_path, size, count)
+        path = tmp_path / f"{size[0]}-{count}.mp4"
+        write_video(path, [np.full((size[1], size[0], 3), 80, np.uint8)] * count, MONO.fps)
+        return path.read_bytes()
 
     files = {video.name: make() for video in track.videos()}
     files["README.txt"] = b"of mine"
-    change(files, make)
+    if says:
+        WRONG[says](files, make)
     with zipfile.ZipFile(tmp_path / "s.zip", "w") as archive:
         for name, content in files.items():
             archive.writestr(name, content)
     _, issues = check_submission(tmp_path / "s.zip", None, "", no_progress)
-    assert bool(issues.refused) == bool(says)
     assert any(line.startswith("README.txt") for line in issues.noted)
-    if says:
-        assert len(issues.refused) == 1
-        assert re.search(says, issues.refused[0]), issues.refused
+    assert len(issues.refused) == bool(says)
+    assert re.search(says, "".join(issues.refused)), issues.refused
 
 
 def test_what_is_no_zip_is_bad_input(track, tmp_path):
     (tmp_path / "no.zip").write_bytes(b"PK nothing")
-    with pytest.raises(InputError, match="the zip of a submission"):
-        check_submission(tmp_path / "no.zip", None, "", no_progress)
-    with pytest.raises(InputError, match="no such file"):
-        check_submission(tmp_path / "nowhere.zip", None, "", no_progress)
+    for name in ("no.zip", "nowhere.zip"):
+        with pytest.raises(InputError, match=name):
+            check_submission(tmp_path / name, None, "", no_progress)
 
 
 def test_the_cost_of_the_codec_is_that_of_unrelated_errors():
@@ -348,16 +301,8 @@ def test_an_avatar_renders_all_test_frames(benchmark, head, tmp_path, monkeypatc
         module, "open_avatar", lambda folder, _: StoredAvatar(avatar_folder(folder), record, method)
     )
     (tmp_path / "avatar").mkdir()
-    words = [
-        "submission",
-        "render",
-        str(tmp_path / "avatar"),
-        "--data",
-        str(benchmark),
-        "--participant",
-        "393",
-    ]
-    words += ["--out", str(tmp_path / "out")]
+    words = ["submission", "render", str(tmp_path / "avatar"), "--data", str(benchmark)]
+    words += ["--participant", "393", "--out", str(tmp_path / "out")]
     assert cli.main(words) == 2  # no files
     save_head(tmp_path / "avatar" / "head_model.npz", head)
     assert cli.main(words) == 0

@@ -107,12 +107,8 @@ def test_affine_files_are_read(rows, tmp_path):
 @pytest.mark.parametrize(
     "content",
     [
-        np.eye(2),
-        np.zeros((3, 3)),
-        np.full((4, 4), np.nan),
-        np.full((4, 4), "a"),
-        np.array([{"a": 1}], dtype=object),
-        np.zeros((4, 4), complex),
+        *(np.eye(2), np.zeros((3, 3)), np.full((4, 4), np.nan), np.full((4, 4), "a")),
+        *(np.array([{"a": 1}], dtype=object), np.zeros((4, 4), complex)),
         *(b"", b"\x93NUMPY\x01\x00", b"PK\x03\x04", None),
     ],
 )
@@ -130,14 +126,8 @@ def test_faulty_affine_files_are_refused(content, tmp_path):
 @pytest.mark.parametrize(
     "value",
     [
-        None,
-        1,
-        "M",
-        [[1, 2, 3]],
-        np.eye(3, 6).tolist(),
-        [[1, 2], [3]],
-        [[[1]]],
-        np.full((3, 3), np.inf).tolist(),
+        *(None, 1, "M", [[1, 2, 3]], [[1, 2], [3]], [[[1]]]),
+        *(np.eye(3, 6).tolist(), np.full((3, 3), np.inf).tolist()),
     ],
 )
 def test_faulty_polynomials_are_refused(value, tmp_path):

@@ -18,14 +18,11 @@ def test_missing_subjects_are_named_with_those_there_are(name, pristine_recordin
     assert ('defaults to "paper"' in error.value.remedy) == (name == "paper")
 
 
-def test_the_way_to_use_a_capture_names_its_head_model(recording, tmp_path):
-    head = str(recording.head)
-    for given, name, expected in (
-        ("", "flame2020", "--head flame2020.pkl"),
-        ("", "", "--head flame2023.pkl"),
-        (head, "", f"--head {head}"),
-    ):
-        findings = prepare_nersemble(
-            recording.settings(tmp_path / f"out-{name}-{bool(given)}", head=given, head_model=name)
-        )
-        assert f"{expected} --out" in findings.text
+@pytest.mark.parametrize(
+    ("name", "expected"), [("flame2020", "flame2020.pkl"), ("", "flame2023.pkl"), ("own", "")]
+)
+def test_the_way_to_use_a_capture_names_its_head_model(pristine_recording, tmp_path, name, expected):
+    head = str(pristine_recording.head) if name == "own" else ""
+    changes = {"head": head, "head_model": "" if head else name}
+    findings = prepare_nersemble(pristine_recording.settings(tmp_path / "out", **changes))
+    assert f"--head {expected or head} --out" in findings.text

@@ -57,14 +57,6 @@ def test_the_still_takes_the_wall_out_of_soft_edges(foreground, wall, mask):
     assert np.abs(image - wanted).max() <= 2
 
 
-def test_without_the_still_a_fringe_stays():
-    frame = np.full((4, 4, 3), 100, np.uint8)  # half foreground 0, half wall 200
-    mask = np.full((4, 4), 128, np.uint8)
-    image, _ = prepare_pixels(frame, mask, (4, 4))
-    clean, _ = prepare_pixels(frame, mask, (4, 4), None, np.full((4, 4, 3), 200, np.uint8))
-    assert image[0, 0, 0] - clean[0, 0, 0] == pytest.approx(200 * 0.5 * 0.5, abs=1.5)
-
-
 def test_nothing_outside_the_mask_is_averaged_in():
     frame = np.full((2, 2, 3), 255, np.uint8)
     frame[0, 0] = 0
@@ -97,9 +89,7 @@ def test_stills_take_the_size_of_the_frames(tmp_path):
 
 
 def test_damaged_stills_are_refused(tmp_path):
-    path = tmp_path / "image_1.jpg"
-    with pytest.raises(InputError, match="no such file"):
-        read_still(path, (4, 4))
-    path.write_bytes(b"\xff\xd8\xff")
-    with pytest.raises(InputError, match="damaged"):
-        read_still(path, (4, 4))
+    (tmp_path / "damaged.jpg").write_bytes(b"\xff\xd8\xff")
+    for name in ("none.jpg", "damaged.jpg"):
+        with pytest.raises(InputError, match=name):
+            read_still(tmp_path / name, (4, 4))

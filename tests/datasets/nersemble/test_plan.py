@@ -73,10 +73,9 @@ def test_unknown_head_models_are_refused(recording, tmp_path):
     for name in ("flame2020", "flame2023", "procedural2023"):
         assert declared(head="", head_model=name) == name
     assert declared(head="") == "flame2023"
-    with pytest.raises(InputError, match="flame2020.*found 'flame2032'") as error:
-        declared(head="", head_model="flame2032")
-    assert error.value.key == "--head-model"
     save_head(recording.head, replace(read_head(recording.head), version="mine"))
     assert declared() == declared(head_model="mine") == "mine"
-    with pytest.raises(InputError, match="expected 'mine'.*found 'flame2020'"):
-        declared(head_model="flame2020")
+    for wrong in ({"head": "", "head_model": "flame2032"}, {"head_model": "flame2020"}):
+        with pytest.raises(InputError, match=wrong["head_model"]) as error:
+            declared(**wrong)
+        assert error.value.key == "--head-model"

@@ -183,10 +183,9 @@ def test_an_image_damaged_in_the_middle_is_found_when_decoding(recording):
 
 def test_an_empty_sequence_is_refused(recording):
     recording.sequence_folder("HAIR").mkdir()
-    with pytest.raises(InputError, match="none of them"):
-        look(recording, "HAIR")
-    with pytest.raises(InputError, match="source=video"):
-        look(recording, source="video")
+    for settings in ({"name": "HAIR"}, {"source": "video"}):
+        with pytest.raises(InputError):
+            look(recording, **settings)
 
 
 def box(kind: bytes, content: bytes) -> bytes:
@@ -196,40 +195,35 @@ def box(kind: bytes, content: bytes) -> bytes:
 FTYP, MOOV, MDAT = box(b"ftyp", b"isom"), box(b"moov", bytes(40)), box(b"mdat", bytes(100))
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        FTYP + MDAT + MOOV,
-        FTYP + MOOV + struct.pack(">I4sQ", 1, b"mdat", 25) + bytes(9),
-        FTYP + MOOV + struct.pack(">I4s", 0, b"mdat") + b"x",
-    ],
-)
-def test_whole_files_pass(content, tmp_path):
+def test_whole_files_pass(tmp_path):
     path = tmp_path / "video.mp4"
-    path.write_bytes(content)
-    check_boxes(path)
+    for mdat in (
+        MDAT,
+        struct.pack(">I4sQ", 1, b"mdat", 25) + bytes(9),
+        struct.pack(">I4s", 0, b"mdat") + b"x",
+    ):
+        path.write_bytes(FTYP + MOOV + mdat)
+        check_boxes(path)
 
 
 @pytest.mark.parametrize("order", [FTYP + MDAT + MOOV, FTYP + MOOV + MDAT])
 def test_every_truncation_is_found(order, tmp_path):
     path = tmp_path / "video.mp4"
+    path.write_bytes(order)
+    check_boxes(path)
     for length in range(len(order)):
         path.write_bytes(order[:length])
         with pytest.raises(InputError):
             check_boxes(path)
 
 
-@pytest.mark.parametrize(
-    "content", [b"\xff\xd8\xff\xe0 a JPEG of some kind", box(b"\x00\x01\x02\x03", b""), b"<html>"]
-)
+@pytest.mark.parametrize("content", [b"\xff\xd8\xff\xe0 a JPEG", box(b"\0\1\2\3", b""), b"<html>", None])
 def test_other_files_are_refused(content, tmp_path):
     path = tmp_path / "video.mp4"
-    path.write_bytes(content)
-    with pytest.raises(InputError) as error:
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=str(path)):
         check_boxes(path)
-    assert error.value.file == str(path)
-    with pytest.raises(InputError, match="No such file"):
-        check_boxes(tmp_path / "none.mp4")
 
 
 def test_a_rotation_that_a_video_asks_for_is_ignored(tmp_path):

@@ -26,6 +26,8 @@ from headbench.datasets.steps.masks import (
 )
 from headbench.datasets.steps.resolution import align_clip
 
+from ..tiny_capture import projected
+
 SIZE = 64
 WHITE, BLUE = (1.0, 1.0, 1.0), (0.0, 0.2, 0.9)
 
@@ -150,11 +152,6 @@ def test_the_neck_line_follows_the_head_in_every_view(view, normal):
     assert neck_line(camera, anchors - 9 * view[2, :3]) is None  # behind the camera
 
 
-def project(camera, point):
-    p = camera.world_to_camera[:3, :3] @ point + camera.world_to_camera[:3, 3]
-    return (camera.K @ p)[:2] / p[2]
-
-
 def test_anchors_lie_where_their_names_say(clip):
     front, left, right, top = clip.head.template[neck_anchors(clip.head)]
     neck = clip.head.template[clip.head.regions["neck"]]
@@ -175,7 +172,7 @@ def test_images_and_masks_end_below_the_line_through_the_neck(clip, tmp_path):
     for key in clip.splits["train"]:
         camera, pose = clip.cameras[key.camera], clip.poses[key.timestep]
         vertices = posed.meshes([pose])[0, anchors]
-        front, left, right, _ = (project(camera, vertex) for vertex in vertices)
+        front, left, right, _ = projected(vertices, camera)
         y, x = np.mgrid[:64, :48] + 0.5
         slope = (left[1] - right[1]) / (left[0] - right[0])
         tilts.add(round(float(slope), 3))

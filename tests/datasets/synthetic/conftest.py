@@ -8,7 +8,6 @@ from scipy.spatial import ConvexHull
 
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.datasets.synthetic.history import over_time
-from headbench.datasets.synthetic.panels import default_samples
 from headbench.datasets.synthetic.performance import CONTROLS
 from headbench.datasets.synthetic.plan import SyntheticSettings, load_geometry, plan_subject
 from headbench.datasets.synthetic.renderer import CaptureRenderer
@@ -40,7 +39,7 @@ def geometry():
 
 @pytest.fixture(scope="session")
 def plan(geometry, tmp_path_factory):
-    settings = SyntheticSettings(1, 3, 8, (48, 70), "procedural", 0, 0.0, default_samples(48, 70))
+    settings = SyntheticSettings(1, 3, 8, (48, 70), "procedural", 0, 0.0, 9)
     return plan_subject(Path(tmp_path_factory.mktemp("plan")), 0, geometry, settings)
 
 

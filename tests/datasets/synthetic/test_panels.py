@@ -76,64 +76,6 @@ def test_a_rectangle_gives_the_light_of_its_closed_form(turn):
     assert not hidden.any()
 
 
-def test_an_occluder_takes_the_share_that_it_hides():
-    """A plate half way up hides the panel's half at x < 0, or all of it, or nothing."""
-    overhead = panel([0.0, 1.0, 0.2], [0.3, 0, 0], [0, 0, 0.4], [0, -1, 0])
-    plate, faces = grid(20, 0.001)
-    for shift, share in ((-1.0, 0.5), (0.0, 0.0), (3.0, 1.0)):
-        cover = grid(2, 1.0, 0.5)
-        scene = tracer({"plate": (plate, faces), "cover": (cover[0] + [shift, 0, 0], cover[1])}, [overhead])
-        direct, _, visible = scene.light("plate", np.arange(400))
-        assert visible[:, 0].mean() == pytest.approx(share, abs=0.02)
-        open_light = tracer({"plate": (plate, faces)}, [overhead]).light("plate", np.arange(400))[0]
-        assert direct.mean() == pytest.approx(share * open_light.mean(), rel=0.05)
-
-
-def bowl(rings=48, spokes=96):
-    """The lower half of the unit sphere, front inwards, with the area around each point."""
-    polar = np.linspace(0.5 * np.pi, np.pi, rings)
-    around = np.linspace(0, 2 * np.pi, spokes, endpoint=False)
-    theta, phi = (a.ravel() for a in np.meshgrid(polar, around, indexing="ij"))
-    points = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1)
-    index = np.arange(rings * spokes).reshape(rings, spokes)
-    a, b = index[:-1], index[1:]
-    a1, b1 = np.roll(a, -1, 1), np.roll(b, -1, 1)
-    faces = np.concatenate(
-        [np.stack([a, b, b1], -1).reshape(-1, 3), np.stack([a, b1, a1], -1).reshape(-1, 3)]
-    )
-    corner = points[faces]
-    facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    if np.einsum("ni,ni->", facing, corner.mean(1)) > 0:
-        faces = faces[:, ::-1]
-    area = np.bincount(faces.ravel(), np.repeat(np.linalg.norm(facing, axis=1), 3))
-    return points, faces, area
-
-
-def test_half_a_sphere_keeps_half_of_its_light():
-    """From everywhere in a hollow half sphere, half of the (cosine-weighted) view is sky and half is sphere, evenly."""
-    points, faces, area = bowl()
-    inner = np.arange(96 * 2, 96 * 44)
-    _, total, _ = tracer({"bowl": (points, faces)}, [], (1.0, 0.5, 0.25), albedo=0.0).light("bowl", inner)
-    np.testing.assert_allclose(total.mean(0), [0.5, 0.25, 0.125], rtol=0.02)
-    scene = tracer({"bowl": (points, faces)}, [OVERHEAD], albedo=0.6)
-    direct, total, _ = scene.light("bowl", np.arange(len(points)))
-    mean = (direct * area[:, None]).sum(0) / area.sum()
-    bounced = (total - direct)[inner].mean(0)
-    np.testing.assert_allclose(bounced, 0.6 * 0.5 * mean, rtol=0.04)
-
-
-def test_a_convex_body_in_a_white_furnace_shows_its_albedo():
-    rng = np.random.default_rng(0)
-    unit = rng.standard_normal((400, 3))
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    scene = PanelTracer([], 16, surroundings=(1.0, 1.0, 1.0))
-    scene.add("ball", 0.1 * unit, hull_faces(unit), np.tile([0.2, 0.5, 0.9], (400, 1)), "cloth")
-    rgb, alpha = scene.image(front_camera(32, 24), 0)
-    np.testing.assert_allclose(
-        rgb[alpha > 0.99], np.tile([0.2, 0.5, 0.9], ((alpha > 0.99).sum(), 1)), rtol=1e-4
-    )
-
-
 def test_gloss_scales_reflections_alone():
     rng = np.random.default_rng(1)
     unit = rng.standard_normal((300, 3))

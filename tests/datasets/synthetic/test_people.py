@@ -1,7 +1,6 @@
 """People, the skin's history, the tracked mesh."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from headbench.datasets.synthetic.anatomy import linear
 from headbench.datasets.synthetic.hair import STYLES
 from headbench.datasets.synthetic.history import coupled_strengths, over_time
 from headbench.datasets.synthetic.people import draw_person, spread
-from headbench.datasets.synthetic.plan import SyntheticSettings, plan_subject
 from headbench.datasets.synthetic.skin import FLUSHES, FOLDS
 from headbench.datasets.synthetic.subject import RenderedSubject
 
@@ -52,27 +50,30 @@ def test_ages_and_skins_of_ten_fall_in_ten_tenths(first):
 
 
 @pytest.fixture(scope="module")
-def bearded(geometry):
-    """A subject with everything that there is."""
-    settings = SyntheticSettings(1, 2, 8, (48, 70), "procedural", 0, 0.0, 16)
-    plan = plan_subject(Path("unused"), 0, geometry, settings)
-    return replace(plan, person=replace(plan.person, beard=0.015, glasses="plastic", sag=1.0))
+def bearded(plan):
+    """A subject with beard and glasses, without the sagging skin of age."""
+    changes = {"beard": 0.015, "glasses": "plastic", "sag": 0.0, "skin": 0.5 * plan.person.skin}
+    return replace(plan, person=replace(plan.person, **changes))
 
 
 @pytest.fixture(scope="module")
-def subject(bearded):
+def dressed(bearded):
     return RenderedSubject(bearded.person, bearded.geometry, bearded.shape)
 
 
-def test_no_skin_stands_out_and_locks_lie_over_the_cap(bearded):
-    who = replace(bearded.person, sag=0.0)
-    subject = RenderedSubject(who, bearded.geometry, bearded.shape)
-    assert subject._cap[subject.hair_share < 0.99].max() == 0.0
-    assert subject._cap.max() > 0.5 * STYLES[who.style].cap
-    normals = vertex_normals(subject._rest_points, subject._fine.faces)
-    surface = subject._rest_points + subject._cap[:, None] * normals
-    _, near = cKDTree(surface).query(subject._hair.vertices)
-    height = ((subject._hair.vertices - surface[near]) * normals[near]).sum(axis=1)
+def test_people_look_different_on_the_same_head(subject, dressed):
+    dark, light = (each.rest_meshes()["skin"].albedo[:, 0].mean() for each in (dressed, subject))
+    assert dark < 0.75 * light
+
+
+def test_no_skin_stands_out_and_locks_lie_over_the_cap(dressed, bearded):
+    cap, points = dressed._cap, dressed._rest_points
+    assert cap[dressed.hair_share < 0.99].max() == 0.0
+    assert cap.max() > 0.5 * STYLES[bearded.person.style].cap
+    normals = vertex_normals(points, dressed._fine.faces)
+    surface = points + cap[:, None] * normals
+    _, near = cKDTree(surface).query(dressed._hair.vertices)
+    height = ((dressed._hair.vertices - surface[near]) * normals[near]).sum(axis=1)
     assert (height < -0.001).mean() < 0.02
 
 
@@ -143,34 +144,34 @@ def test_the_tracked_mesh_has_hair_volume_and_not_locks(bearded):
     assert np.linalg.norm(offset[edges[:, 0]] - offset[edges[:, 1]], axis=1).max() < 0.5 * style.cap + 0.002
 
 
-def test_beard_and_glasses_lie_on_the_face_and_move_with_it(bearded, subject, rest):
-    assert {"beard", "glasses"} <= subject.rest_meshes().keys()
+def test_beard_and_glasses_lie_on_the_face_and_move_with_it(bearded, dressed, rest):
+    assert {"beard", "glasses"} <= dressed.rest_meshes().keys()
     pose = bearded.geometry.translation.pose(rest, "900", 0)
-    calm = subject.posed_meshes(pose, rest, settled(rest, bearded.person))
+    calm = dressed.posed_meshes(pose, rest, settled(rest, bearded.person))
     skin = calm["skin"].vertices
     assert cKDTree(skin).query(calm["beard"].vertices)[0].max() < 0.025
     assert 0.001 < cKDTree(skin).query(calm["glasses"].vertices)[0].max() < 0.04
-    mouth, ear = subject.anatomy["mouth"], subject.anatomy["left_ear"]
+    mouth, ear = dressed.anatomy["mouth"], dressed.anatomy["left_ear"]
     assert calm["beard"].vertices[:, 1].max() > ear[1] - 0.01
     middle = np.abs(calm["beard"].vertices - mouth)[:, :2] < np.array([0.012, 0.002])
     assert middle.all(axis=1).mean() < 0.002  # hardly any hair lies over the lips
     opened = {**rest, "jaw_open": 1.0}
     pose = bearded.geometry.translation.pose(opened, "900", 0)
-    moved = subject.posed_meshes(pose, opened, settled(opened, bearded.person))
+    moved = dressed.posed_meshes(pose, opened, settled(opened, bearded.person))
     fall = calm["beard"].vertices[:, 1] - moved["beard"].vertices[:, 1]
     assert np.percentile(fall, 90) > 0.01
     np.testing.assert_array_equal(moved["glasses"].vertices, calm["glasses"].vertices)
 
 
-def test_stretched_skin_shines_more(bearded, subject, rest):
+def test_stretched_skin_shines_more(bearded, dressed, rest):
     puffed = {**rest, "cheek_puff": 1.0}
     gloss = [
-        subject.posed_meshes(bearded.geometry.translation.pose(a, "900", 0), a, settled(a, bearded.person))[
+        dressed.posed_meshes(bearded.geometry.translation.pose(a, "900", 0), a, settled(a, bearded.person))[
             "skin"
         ].gloss
         for a in (rest, puffed)
     ]
-    cheek = np.linalg.norm(subject._rest_points - subject.anatomy["left_cheek"], axis=1) < 0.025
+    cheek = np.linalg.norm(dressed._rest_points - dressed.anatomy["left_cheek"], axis=1) < 0.025
     change = gloss[1][cheek] / gloss[0][cheek]
     assert np.percentile(change, 95) > 1.1
     assert all(each.min() >= 0.1 and each.max() <= 4.0 for each in gloss)

@@ -14,7 +14,7 @@ from headbench.datasets.synthetic.performance import (
 )
 
 
-@pytest.mark.parametrize("timesteps", [4, 8, 15, 16, 40, 60, 88, 300])
+@pytest.mark.parametrize("timesteps", [4, 8, 15, 16, 60, 300])
 def test_timesteps_are_shared_out_exactly(timesteps):
     shares = share_out(timesteps)
     assert sum(shares.values()) == timesteps
@@ -24,19 +24,16 @@ def test_timesteps_are_shared_out_exactly(timesteps):
     assert timesteps < 300 or list(shares) == list(SEQUENCES)
 
 
-@pytest.mark.parametrize("timesteps", [60, 156, 400])
+@pytest.mark.parametrize("timesteps", [60, 400])
 def test_a_performance_in_parts_has_every_sequence(timesteps):
+    with pytest.raises(InputError, match="at least 59"):
+        share_out(20, "parts")
     shares = share_out(timesteps, "parts")
     assert sum(shares.values()) == timesteps
     assert set(shares) == set(SEQUENCES) - {HELD_OUT} | set(FREE_PARTS)
     assert min(shares.values()) >= 2
     held = sum(count for name, count in shares.items() if name.startswith(HELD_OUT))
     assert held == pytest.approx(0.25 * timesteps, abs=1)
-
-
-def test_too_few_timesteps_for_parts_are_refused():
-    with pytest.raises(InputError, match="at least 59"):
-        share_out(20, "parts")
 
 
 def test_parts_of_free_are_further_and_further_from_training():

@@ -1,13 +1,12 @@
 import numpy as np
 import pytest
 
-from headbench.bench.errors import InputError
 from headbench.datasets.synthetic.plan import FRONTAL, SERIALS, cameras
 
 TARGET = np.array([0.01, 0.02, 0.03])
 
 
-@pytest.mark.parametrize("count", range(1, 17))
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 15, 16])
 def test_every_set_has_the_frontal_camera_in_canonical_order(count):
     made = list(cameras(count, 100, 146, TARGET))
     assert len(made) == count
@@ -37,9 +36,3 @@ def test_principal_point_is_off_centre_but_near():
     offset = K[:2, 2] - [275, 401]
     assert 0 < np.abs(offset).min()
     assert np.abs(offset).max() < 0.01 * 550
-
-
-def test_impossible_counts_are_refused():
-    for count in (0, 17):
-        with pytest.raises(InputError, match="cameras"):
-            cameras(count, 100, 146, TARGET)

@@ -106,12 +106,9 @@ def test_an_exposure_adds_light_where_it_is_covered():
     np.testing.assert_allclose(rgb[0], [red, 0.5 * (red + blue)])
 
 
-@pytest.mark.parametrize(("speed", "several"), [(0.0, False), (0.9, True)])
-def test_a_moving_head_is_the_mean_of_its_sub_frames(plan, recorded, speed, several):
+def test_a_moving_head_is_the_mean_of_its_sub_frames(plan, recorded):
     def curves(time):
-        return {
-            name: speed * (time - 1.0) if name == "head_turn" else np.zeros(len(time)) for name in CONTROLS
-        }
+        return {name: 0.9 * (time - 1.0) if name == "head_turn" else np.zeros(len(time)) for name in CONTROLS}
 
     zero = dict.fromkeys(CONTROLS, 0.0)
     turning = Performed("FREE", [zero], {}, 1.0, np.ones(1), curves)
@@ -122,18 +119,16 @@ def test_a_moving_head_is_the_mean_of_its_sub_frames(plan, recorded, speed, seve
     )
     sharp, blurred = recorded(moving), recorded(moving, motion_blur=4.0)
     offsets = blurred.sub_frames("FREE", 0)
-    assert (len(offsets) > 1) is several
+    assert len(offsets) > 1
     assert offsets.sum() == pytest.approx(0.0)
     blurred.render_frames("FREE", 0, [FRONTAL])
     seed, masks = plan.render_seed("FREE", 0, FRONTAL), []
     for offset in offsets:
         sharp.pose_at("FREE", 0, offset)
-        picture, mask = sharp.render(FRONTAL, seed)
+        _, mask = sharp.render(FRONTAL, seed)
         masks.append(mask.astype(float))
-    written, found = blurred._plan.writer.written[FRONTAL]
+    _, found = blurred._plan.writer.written[FRONTAL]
     np.testing.assert_allclose(found, np.mean(masks, axis=0), atol=1.0)
-    if not several:
-        np.testing.assert_array_equal(written, picture)
 
 
 def disc(radius, size=120):
@@ -155,18 +150,15 @@ def test_a_matte_displaces_the_outline_of_hair(level):
     assert (found - alpha).min() < -0.3 * min(level, 1.0)
 
 
-def test_a_matte_keeps_what_is_not_hair():
+def test_a_matte_keeps_what_is_not_hair_and_no_single_hair():
     alpha, _ = disc(40.0)
     left = np.zeros(alpha.shape)
     left[:, :60] = 1.0
     found = matte(alpha, left, 1.0, METRE, 3)
     np.testing.assert_array_equal(found[:, 60:], alpha[:, 60:])
     np.testing.assert_array_equal(matte(np.zeros((9, 9)), np.ones((9, 9)), 1.0, METRE, 3), np.zeros((9, 9)))
-
-
-def test_a_single_hair_is_lost():
     alpha, _ = disc(30.0)
-    alpha[60, 95:110] = 1.0  # as thick as a pixel, a quarter of what a matte keeps
+    alpha[60, 95:110] = 1.0  # a hair as thick as a pixel, a quarter of what a matte keeps, is lost
     assert matte(alpha, np.ones(alpha.shape), 1.0, METRE, 3)[60, 98:108].max() < 0.5
 
 

@@ -1,5 +1,7 @@
 """Stored poses are as far from the exact ones as their level says, in the way that trackers are wrong."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -27,11 +29,8 @@ def poses():
     ]
 
 
-def test_zero_noise_changes_nothing(poses):
-    assert with_tracking_noise(poses, 0.0, 1) == poses
-
-
 def test_noise_is_the_stated_fraction_of_each_deviation(poses):
+    assert with_tracking_noise(poses, 0.0, 1) == poses
     noisy = with_tracking_noise(poses, 0.1, 1)
     error = np.stack([a.expression - b.expression for a, b in zip(noisy, poses)])
     np.testing.assert_allclose(error.std(0), [0.1, 0.4, 0.0], rtol=0.06, atol=1e-7)
@@ -65,6 +64,7 @@ def exact(geometry, performed):
 
 @pytest.fixture(scope="module")
 def track(geometry, shape, performed, exact):
+    @cache
     def track(level, seed=3):
         return with_tracking_error(exact, performed, geometry.translation, geometry.head, shape, level, seed)
 
@@ -72,58 +72,55 @@ def track(geometry, shape, performed, exact):
 
 
 @pytest.fixture(scope="module")
-def distances(geometry, shape, exact):
-    """(T, V) millimetres between tracked and exact vertices."""
-    model = HeadModel(geometry.head, dtype=torch.float64)
+def millimetres(geometry, shape):
+    """Distances between exact and tracked vertices of the skin without lips, of the lips, and of all: (T, n) each."""
+    model, parts = HeadModel(geometry.head, dtype=torch.float64), geometry.head
 
-    def vertices(sequences):
-        poses = [pose for each in sequences.values() for pose in each]
-        return model(shape=torch.from_numpy(shape), **model.pose_arguments(poses)).numpy()
+    def millimetres(exact, tracked):
+        there, found = (
+            model(
+                shape=torch.from_numpy(shape), **model.pose_arguments([p for s in each.values() for p in s])
+            )
+            for each in (exact, tracked)
+        )
+        off = 1e3 * np.linalg.norm((found - there).numpy(), axis=2)
+        lips = region(parts, "lips")
+        return off[:, np.setdiff1d(region(parts, "face"), lips)], off[:, lips], off
 
-    there = vertices(exact)
-    return lambda tracked: 1e3 * np.linalg.norm(vertices(tracked) - there, axis=2)
+    return millimetres
 
 
-def test_level_zero_is_exact(track, exact):
+def test_the_level_scales_errors_of_trackers(track, millimetres, exact):
     assert track(0.0) == exact
-
-
-def test_level_one_is_as_far_off_as_trackers_are(track, distances, geometry):
-    off = distances(track(1.0))
-    skin = np.setdiff1d(region(geometry.head, "face"), region(geometry.head, "lips"))
-    assert 0.5 < off[:, skin].mean() < 1.0
-    assert 2.0 < np.sqrt((off[:, region(geometry.head, "lips")] ** 2).mean()) < 3.0
+    skin, lips, off = millimetres(exact, track(1.0))
+    assert 0.5 < skin.mean() < 1.0
+    assert 2.0 < np.sqrt((lips**2).mean()) < 3.0
     assert off.max() < 15.0
-
-
-def test_half_the_level_is_half_the_error(track, distances):
-    assert distances(track(0.5)).mean() == pytest.approx(0.5 * distances(track(1.0)).mean(), rel=0.03)
+    assert millimetres(exact, track(0.5))[2].mean() == pytest.approx(0.5 * off.mean(), rel=0.03)
 
 
 def test_expressions_shrink(track, exact):
-    true, found = (
-        np.concatenate([[pose.expression for pose in each] for each in poses.values()])
-        for poses in (exact, track(1.0))
-    )
+    true, found = (np.concatenate(stacked(poses, "expression")) for poses in (exact, track(1.0)))
     assert 0.5 < (true * found).sum() / (true * true).sum() < 0.95
 
 
 def test_drift_persists_within_a_sequence(track, exact):
     """The error of the head's position, which no expression causes, resembles that of the timestep before."""
-    for name in SEQUENCES:
-        off = np.array([a.translation - b.translation for a, b in zip(track(1.0)[name], exact[name])])
-        off = np.concatenate(
-            [off, [a.rotation - b.rotation for a, b in zip(track(1.0)[name], exact[name])]], 1
-        )
-        off -= off.mean(0)
+    shifts, turns = (
+        [found - true for found, true in zip(stacked(track(1.0), field), stacked(exact, field))]
+        for field in ("translation", "rotation")
+    )
+    for off in map(np.hstack, zip(shifts, turns)):
+        off = off - off.mean(0)
         assert (off[1:] * off[:-1]).sum() / (off * off).sum() > 0.35
 
 
 def test_a_seed_gives_the_same_poses_and_another_others(track):
-    same = [[getattr(pose, f).tolist() for f in FIELDS if f != "eyelids"] for pose in track(1.0)["FREE"]]
-    again = [[getattr(pose, f).tolist() for f in FIELDS if f != "eyelids"] for pose in track(1.0)["FREE"]]
-    assert same == again
-    assert track(1.0, seed=4)["FREE"][0].jaw.tolist() != track(1.0)["FREE"][0].jaw.tolist()
+    one, again = track(1.0), track.__wrapped__(1.0)
+    for field in FIELDS:
+        if field != "eyelids":
+            np.testing.assert_array_equal(stacked(one, field), stacked(again, field))
+    assert track(1.0, seed=4)["FREE"][0].jaw.tolist() != one["FREE"][0].jaw.tolist()
 
 
 VIDEO_SEQUENCES = ("EXP-4-lips", "EMO-2-surprise+fear", "FREE-2-recombined")
@@ -133,6 +130,7 @@ VIDEO_SEQUENCES = ("EXP-4-lips", "EMO-2-surprise+fear", "FREE-2-recombined")
 def video(geometry, shape):
     """(exact, tracked) at level 1 by a tracker of videos of natural performances, every ``every``-th frame."""
 
+    @cache
     def video(every, count=200, level=1.0):
         played = {n: perform(n, count, 2, kind="natural", every=every) for n in VIDEO_SEQUENCES}
         controls = {name: each.activations for name, each in played.items()}
@@ -148,18 +146,10 @@ def stacked(sequences, field):
     return [np.stack([getattr(pose, field) for pose in each]) for each in sequences.values()]
 
 
-def test_a_tracker_of_videos_is_as_far_off_as_recorded(video, geometry, shape):
-    exact, tracked = video(8, 60)
-    model = HeadModel(geometry.head, dtype=torch.float64)
-
-    def vertices(sequences):
-        poses = [pose for each in sequences.values() for pose in each]
-        return model(shape=torch.from_numpy(shape), **model.pose_arguments(poses)).numpy()
-
-    off = 1e3 * np.linalg.norm(vertices(tracked) - vertices(exact), axis=2)
-    skin = np.setdiff1d(region(geometry.head, "face"), region(geometry.head, "lips"))
-    assert 0.3 < off[:, skin].mean() < 0.8
-    assert 0.7 < np.sqrt((off[:, region(geometry.head, "lips")] ** 2).mean()) < 1.6
+def test_a_tracker_of_videos_is_as_far_off_as_recorded(video, millimetres):
+    skin, lips, _ = millimetres(*video(8, 60))
+    assert 0.3 < skin.mean() < 0.8
+    assert 0.7 < np.sqrt((lips**2).mean()) < 1.6
 
 
 def test_a_tracker_of_videos_is_smooth_at_video_rate(video):
@@ -207,12 +197,9 @@ def test_errors_of_videos_depend_on_time_not_on_the_frames_kept(video):
 
 
 def test_part_of_the_error_lasts_for_a_sequence(video):
-    exact, tracked = video(8, 60)
-    spread = np.concatenate(stacked(exact, "expression")).std(axis=0)
+    exact, tracked = (stacked(each, "expression") for each in video(8, 60))
+    spread = np.concatenate(exact).std(axis=0)
     used = spread > 1e-3
-    means = [
-        ((a - b).mean(axis=0) / np.maximum(spread, 1e-9))[used]
-        for a, b in zip(stacked(tracked, "expression"), stacked(exact, "expression"))
-    ]
+    means = [((a - b).mean(axis=0) / np.maximum(spread, 1e-9))[used] for a, b in zip(tracked, exact)]
     between = np.std(means, axis=0)  # over sequences
     assert 0.15 < np.sqrt((between**2).mean()) < 0.6

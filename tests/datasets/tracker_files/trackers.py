@@ -1,7 +1,5 @@
 """Files of trackers, written from one camera of a capture by the formulae of the trackers' own programs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -75,12 +73,8 @@ def write_metrical(recording: Recording, folder: Path) -> Path:
         content = {
             "flame": flame(recording, pose, lids_of(pose))
             | {"tex": single(np.zeros(140), 140), "sh": single(np.ones(27), 9, 3)},
-            "camera": {
-                "R": single(R[:2], 6),
-                "t": single(t, 3),
-                "fl": single(focal, 1),
-                "pp": single(centre, 2),
-            },
+            "camera": {"R": single(R[:2], 6), "t": single(t, 3)}
+            | {"fl": single(focal, 1), "pp": single(centre, 2)},
             "opencv": {
                 "R": single((R * LEFT_UP).T, 3, 3),
                 "t": single(t * LEFT_UP, 3),
@@ -130,7 +124,7 @@ def write_pixel3dmm(recording: Recording, folder: Path, *, tracked: int) -> Path
             "flame": flame(recording, pose, lids_of(pose))
             | {
                 "neck": single(six_numbers(pose.neck), 6),
-                "R": single(six_numbers_of(motion), 6),
+                "R": single(motion[:2, :3], 6),
                 "R_rotation_matrix": single(motion[:3, :3], 3, 3),
                 "t": single(motion[:3, 3], 3),
             },
@@ -154,10 +148,6 @@ def write_pixel3dmm(recording: Recording, folder: Path, *, tracked: int) -> Path
             cv2.imwrite(str(path), pixels.astype(np.uint8))
     save_head(folder / "track" / HEAD_FILE, recording.head)
     return folder / "track"
-
-
-def six_numbers_of(motion: np.ndarray) -> np.ndarray:
-    return motion[:2, :3].ravel()
 
 
 def rest_mesh(recording: Recording, key: Any) -> np.ndarray:

@@ -64,5 +64,5 @@ def test_landmarks_are_found_where_they_are(head, pictures, error, most):
 def test_a_network_that_sees_no_face_is_an_error(head, pictures):
     network = Network(pictures, np.zeros(COUNT, int))
     network.find = lambda image, near=None: None
-    with pytest.raises(InputError, match="pictures in which the network finds faces.*found 0 landmarks"):
+    with pytest.raises(InputError, match="found 0 landmarks"):
         learn_embedding(network, head, pictures)

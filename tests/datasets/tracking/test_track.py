@@ -62,65 +62,68 @@ def test_colours_correct_landmarks(clip, tracked):
     assert tracked.clip.steps[-1].name == "track"
 
 
-def test_the_clips_own_tracking_is_not_used(clip, tracked):
-    cameras = [*clip.cameras]
-    landmarks = source(clip, cameras)(sorted(clip.poses))
+@pytest.fixture(scope="module")
+def frontal(clip):
+    """The frontal camera, and the clip as the tracker sees it with that alone."""
+    name = next(name for name in clip.cameras if name.endswith("37"))
+    return name, track(clip, [name], source(clip, [name])).clip
+
+
+def test_the_clips_own_tracking_is_not_used(clip, frontal):
+    camera, tracked = frontal
+    landmarks = source(clip, [camera])(sorted(clip.poses))
     wrong = {t: replace(p, jaw=np.ones(3), translation=np.full(3, 9.0)) for t, p in clip.poses.items()}
     other = replace(clip, poses=wrong, shape=clip.shape + 5, static_offset=clip.static_offset + 1)
-    found = track(other, cameras, lambda timesteps: landmarks).clip
-    np.testing.assert_array_equal(found.shape, tracked.clip.shape)
+    found = track(other, [camera], lambda timesteps: landmarks).clip
+    np.testing.assert_array_equal(found.shape, tracked.shape)
     for timestep, pose in found.poses.items():
-        np.testing.assert_array_equal(pose.jaw, tracked.clip.poses[timestep].jaw)
+        np.testing.assert_array_equal(pose.jaw, tracked.poses[timestep].jaw)
 
 
-def test_one_camera_is_enough(clip):
-    frontal = next(name for name in clip.cameras if name.endswith("37"))
-    views = Views([clip.cameras[frontal]])
+def test_one_camera_is_enough(clip, frontal):
+    camera, single = frontal
+    views = Views([clip.cameras[camera]])
     timesteps, face = sorted(clip.poses), np.asarray(clip.head.regions["face"])
 
     def places(one):
         meshes = PosedSubject.of(one).meshes([one.poses[timestep] for timestep in timesteps])
         return np.array([views.place(mesh[face])[0][0] for mesh in meshes])
 
-    single = track(clip, [frontal], source(clip, [frontal])).clip
-    gaps = [places(one) - places(clip) for one in (single, by_landmarks(clip, [frontal]))]
+    gaps = [places(one) - places(clip) for one in (single, by_landmarks(clip, [camera]))]
     after, before = (np.linalg.norm(gap - gap.mean(axis=0), axis=2).mean() for gap in gaps)
     assert after < 0.7 * before
 
 
-def test_blocks_share_the_shape(clip, monkeypatch):
+def test_blocks_share_the_shape(clip, frontal, monkeypatch):
     monkeypatch.setattr("headbench.datasets.tracking.track.MOST_TIMESTEPS", 3)
-    cameras, asked = [*clip.cameras], []
+    asked = []
 
     def noted(timesteps):
         asked.append([*timesteps])
-        return source(clip, cameras)(timesteps)
+        return source(clip, frontal[:1])(timesteps)
 
-    tracked, report = track(clip, cameras, noted)
+    tracked, report = track(clip, frontal[:1], noted)
     assert [len(part) for part in asked] == [3, 2]
     assert sorted(asked[0] + asked[1]) == sorted(tracked.poses) == [one.timestep for one in report.residuals]
 
 
-@pytest.mark.parametrize(("cameras", "found"), [([], "none"), (["nowhere"], "nowhere")])
-def test_cameras_that_are_missing_are_refused(clip, cameras, found):
-    with pytest.raises(InputError, match=f"cameras.*{found}"):
-        track(clip, cameras, source(clip, [*clip.cameras]))
+def test_what_is_missing_is_refused(clip):
+    cameras = [*clip.cameras]
 
-
-def test_no_landmarks_are_refused(clip):
     def nothing(timesteps):
-        landmarks = source(clip, [*clip.cameras])(timesteps)
+        landmarks = source(clip, cameras)(timesteps)
         return landmarks._replace(pixels=np.full_like(landmarks.pixels, np.nan))
 
-    with pytest.raises(InputError, match="landmarks"):
-        track(clip, [*clip.cameras], nothing)
-
-
-def test_a_missing_frame_is_refused(clip):
     key = min(clip.files)
-    files = {one: file for one, file in clip.files.items() if one != key}
-    with pytest.raises(InputError, match=f"timestep {key.timestep} of camera {key.camera}"):
-        track(replace(clip, files=files), [*clip.cameras], source(clip, [*clip.cameras]))
+    without = replace(clip, files={one: file for one, file in clip.files.items() if one != key})
+    for given, found in (
+        ((clip, [], source(clip, cameras)), "cameras.*none"),
+        ((clip, ["nowhere"], source(clip, cameras)), "cameras.*nowhere"),
+        ((clip, cameras, nothing), "landmarks"),
+        ((without, cameras, source(clip, cameras)), f"timestep {key.timestep} of camera {key.camera}"),
+    ):
+        with pytest.raises(InputError, match=found):
+            track(*given)
 
 
 def test_landmarks_are_seeded_and_wrong(clip):

@@ -31,20 +31,13 @@ def test_the_clip_has_other_tracking_and_the_same_frames(clip, tmp_path, monkeyp
         assert 1e-5 < gap < 0.05
 
 
+@pytest.mark.commands
 def test_the_change_reaches_the_rows(patterned_capture, tmp_path):
     conditions = json.dumps([{}, {"name": "tracked", "clip": {"name": "tracked", "parameters": {"seed": 2}}}])
-    words = [
-        "run",
-        "--data",
-        str(patterned_capture.union),
-        "--methods",
-        "ga",
-        "--preset",
-        "smoke",
-        "--out",
-        str(tmp_path / "r"),
-    ]
-    assert cli.main([*words, "--set", "metrics=psnr", "--set", f"conditions={conditions}"]) == 0
+    words = f"run --data {patterned_capture.union} --methods ga --preset smoke --out {tmp_path / 'r'}".split()
+    for setting in ("settings.ga.budget.iterations=2", "metrics=psnr", f"conditions={conditions}"):
+        words += ["--set", setting]
+    assert cli.main(words) == 0
     rows = pd.read_parquet(tmp_path / "r" / "rows.parquet")
     means = rows[rows["metric"] == "psnr"].groupby("condition")["value"].mean()
     assert set(means.index) == {"", "tracked"}

@@ -60,18 +60,12 @@ def test_masks_overlap_the_true_ones(filmed):
 
 def test_what_shows_no_empty_room_is_refused(filmed):
     images, _, faces, empty = filmed
-    with pytest.raises(
-        InputError,
-        match=r"at least 10 frames that show nobody's face, for --masks background, found 9[\s\S]*leave the picture",
-    ):
-        learn_background("me.mp4", empty[:9])
     moved = [np.roll(image, 9 * number, axis=1) for number, image in enumerate(empty)]
-    with pytest.raises(
-        InputError, match=r"the same empty room[\s\S]*of the pixels change in them[\s\S]*stands still"
-    ):
-        learn_background("me.mp4", moved)
+    for shown, found in ((empty[:9], "at least 10 frames"), (moved, "the same empty room")):
+        with pytest.raises(InputError, match=found):
+            learn_background("me.mp4", shown)
     background = learn_background("me.mp4", [images[2]] * EMPTY)  # somebody without a face that is found
-    with pytest.raises(InputError, match="pixels are unsure, for --masks background, found"):
+    with pytest.raises(InputError, match="pixels are unsure"):
         check_background("me.mp4", background, [images[2]], faces[2:3])
 
 

@@ -135,14 +135,7 @@ def test_landmarks_are_stored_meanwhile_for_a_kill(tmp_path, monkeypatch):
     assert [bool(one["finished"]) for one in stored] == [False] * 12 + [True]
 
 
-@pytest.mark.parametrize(
-    ("shown", "message"),
-    [
-        ([[]] * 4, "in at least 50% of the frames, found no face in any of 4"),
-        ([[face(50)]] + [[]] * 3, "found it in 1 of 4"),
-        ([], "found no face in any of 0"),
-    ],
-)
-def test_too_few_frames_with_the_face_are_refused(tmp_path, shown, message):
-    with pytest.raises(InputError, match=message):
+@pytest.mark.parametrize("shown", [[[]] * 4, [[face(50)]] + [[]] * 3, []])
+def test_too_few_frames_with_the_face_are_refused(tmp_path, shown):
+    with pytest.raises(InputError, match="me.mp4"):
         found(tmp_path, shown)

@@ -55,16 +55,13 @@ def test_the_mask_has_the_size_of_the_image(network):
     assert (mask[20:] == 0).all()
 
 
-def test_another_network_is_refused(network):
+def test_what_cannot_segment_is_refused(network, monkeypatch, tmp_path):
     path, shapes = network
-    shapes["output"] = (1, 8, 4, 2)
-    with pytest.raises(InputError, match=r"segments a person, found an output of shape \(1, 8, 4, 2\)"):
-        SelfieSegmentation(path)
-
-
-def test_without_file_or_package_the_remedy_says_where_they_are(network, monkeypatch, tmp_path):
-    with pytest.raises(InputError, match=r"no such file[\s\S]*wheel of mediapipe"):
+    with pytest.raises(InputError, match="no such file"):
         SelfieSegmentation(tmp_path / "none.tflite")
+    shapes["output"] = (1, 8, 4, 2)
+    with pytest.raises(InputError, match=r"an output of shape \(1, 8, 4, 2\)"):
+        SelfieSegmentation(path)
     monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
-    with pytest.raises(UnavailableError, match=r"ai-edge-litert[\s\S]*track"):
-        SelfieSegmentation(network[0])
+    with pytest.raises(UnavailableError, match="ai-edge-litert"):
+        SelfieSegmentation(path)

@@ -84,7 +84,7 @@ def imported(capture, out, ply):
 
 @pytest.mark.parametrize(
     ("change", "rest", "says"),
-    [({}, 12, "f_rest"), ({"binding_0": -1}, 45, "binding_0"), ({"binding_0": 10**6}, 45, "binding_0")],
+    [({}, 12, "f_rest"), ({"binding_0": -1}, 45, "binding"), ({"binding_0": 10**6}, 45, "binding")],
 )
 def test_what_is_of_no_degree_or_on_no_triangle_is_refused(capture, tmp_path, change, rest, says):
     ply = ga_file(tmp_path / "in.ply", [{**ROWS[0], **change}], rest)

@@ -245,4 +245,4 @@ def test_settings_that_do_not_fit_the_tensors_are_refused(avatar, clip, tmp_path
     tensors, metadata = read_safetensors(path)
     save_file(tensors, path, {"settings": json.dumps({**json.loads(metadata["settings"]), **change})})
     with pytest.raises(InputError, match=r"avatar\.safetensors"):
-        TrainedSplats.read(path, clip.head, "cpu")
+        TrainedSplats.of(path, *read_safetensors(path), clip.head, "cpu")

@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.methods.avatars.compact.codecs import write_coded
+from headbench.methods.avatars.compact.codecs import parts_of, write_coded
 from headbench.methods.avatars.compact.precision import EXACT, Precision
 from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.flashavatar.hyper_gaussians import (
@@ -120,7 +120,7 @@ def test_an_avatar_is_stored_with_its_gaussians(trained, clip):
 @pytest.mark.parametrize(("precision", "tolerance"), [(EXACT, 2e-3), (Precision(), 0.05)])
 def test_a_coded_avatar_has_its_gaussians(trained, clip, tmp_path, precision, tolerance):
     _, method, avatar = trained
-    write_coded(avatar, clip.head, tmp_path, precision, None, None)
+    write_coded(parts_of(avatar, clip.head, None), clip.head, tmp_path, precision, None)
     coded = method.load(tmp_path, device="cpu")
     camera, pose = first_view(clip)
     difference = np.abs(coded.render(camera, pose).rgb - avatar.render(camera, pose).rgb)
@@ -147,10 +147,10 @@ def test_damaged_gaussians_are_refused(trained, clip, tmp_path):
     for change in ({name: broken}, {name: tensors[name][:, :3].clone()}):
         save_file({**tensors, **change}, path, metadata)
         with pytest.raises(InputError, match=name):
-            TrainedSplats.read(path, clip.head, "cpu")
+            TrainedSplats.of(path, *read_safetensors(path), clip.head, "cpu")
     save_file({key: value for key, value in tensors.items() if key != name}, path, metadata)
     with pytest.raises(InputError, match=name):
-        TrainedSplats.read(path, clip.head, "cpu")
+        TrainedSplats.of(path, *read_safetensors(path), clip.head, "cpu")
 
 
 @pytest.mark.parametrize("latent", [-1, 129])

@@ -1,5 +1,7 @@
 """The avatar's file: what goes in comes out, what it costs, what is refused."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -7,9 +9,10 @@ from safetensors.torch import load_file, save_file
 
 from headbench.bench.errors import InputError
 from headbench.methods.gbs.blendshapes import Entries, difference_widths
-from headbench.methods.gbs.storage import EXPRESSIONS, MEMBERS, read_avatar, write_avatar
+from headbench.methods.gbs.storage import EXPRESSIONS, MEMBERS, stored_of, write_avatar
 from headbench.methods.shared.avatar_files import AVATAR_FILE
 from headbench.methods.shared.surface_points import SurfacePoints, full_barycentric
+from headbench.methods.shared.tensor_files import read_safetensors
 
 FACES, EXPRESSION_SIZE = 40, 60
 PUBLISHED_BYTES = 4 * 3128  # what the authors' viewer reads for each splat
@@ -44,7 +47,8 @@ def write(path, count=30, expressions=50, degree=3, difference_degree=3, share=0
 
 
 def read(path):
-    return read_avatar(path, FACES, EXPRESSION_SIZE, "cpu")
+    head = SimpleNamespace(faces=range(FACES), expression_basis=np.zeros((1, 3, EXPRESSION_SIZE)))
+    return stored_of(path, *read_safetensors(path), head, "cpu")
 
 
 @pytest.mark.parametrize(("degree", "difference_degree"), [(3, 3), (3, 0), (2, 1), (0, 0)])

@@ -176,13 +176,6 @@ def test_of_a_larger_picture_some_part_is_cut_out(draws):
     assert larger.alpha.all()
 
 
-def test_zooms_cover_all_factors_and_places():
-    zooms = {Zoom.of((20, 15), torch.rand(3).tolist()) for _ in range(2000)}
-    assert {zoom.size[0] for zoom in zooms} == set(range(16, 25))
-    assert {zoom.start[0] for zoom in zooms if zoom.size[0] == 16} == set(range(-4, 1))
-    assert {zoom.start[1] for zoom in zooms if zoom.size[0] == 24} == set(range(4))
-
-
 def test_beyond_its_bounds_the_code_only_moves_points():
     head, tensors, signal, motion, _ = model()
     high = torch.full((CODE,), 0.5, dtype=torch.float64)

@@ -1,9 +1,5 @@
 """The networks have the published sizes, and compute what the plain layers side by side do."""
 
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-from pathlib import Path
-
 import pytest
 import torch
 import torch.nn.functional as F
@@ -143,32 +139,6 @@ def test_super_resolution_in_strips_is_that_of_the_whole_image(height, width, wi
     expected = network(weights, drawn, GROUND)
     found = network.bounded(weights, drawn, GROUND, at_once)
     torch.testing.assert_close(found, expected, atol=1e-9, rtol=1e-9)
-
-
-def peak_of_a_4k_image() -> int:
-    """Kilobytes that this process grows by at most while the published network makes a 4K image."""
-
-    def status(name: str) -> int:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return next(int(line.split()[1]) for line in lines if line.startswith(name))
-
-    config = GHAConfig()
-    network = SuperResolution(config.channels, config.sr_widths)
-    weights = network.initial(torch.Generator().manual_seed(9), "cpu")
-    features = torch.randn(540, 960, config.channels, generator=torch.Generator().manual_seed(10))
-    before = status("VmRSS")
-    image = network.bounded(weights, FeatureImage(features, torch.ones(540, 960)), GROUND.float())
-    assert image.shape == (2160, 3840, 3)
-    assert torch.isfinite(image).all()
-    assert 0 <= image.min() < image.max() <= 1
-    return status("VmHWM") - before
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the peak is read from Linux's /proc")
-def test_a_4k_image_of_the_published_design_takes_bounded_memory():
-    with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
-        assert fresh.submit(peak_of_a_4k_image).result() < 2_000_000
 
 
 @pytest.mark.parametrize("widths", [(4,), (5, 3)])

@@ -63,7 +63,6 @@ def answers():
             found[key] = ask(command, *arguments)
         return found[key]
 
-    answer.ask = ask
     return answer
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 
@@ -45,22 +43,10 @@ def rendered(avatar, wanted, ground=WHITE):
     return found
 
 
-def with_an_odd_size(wanted):
-    """The same list, whose first frame has another width than the others."""
-    odd, (camera, pose) = next(iter(wanted.items()))
-    return wanted | {odd: (replace(camera, width=30), pose)}
-
-
-def workplace(method, folder):
-    """An empty place to export to."""
-    work = Workplace.at(folder, method.inspect())
-    work.make()
-    return work
-
-
 def export(method, clip, folder):
     """Export the clip's training frames: the place, and the images in it by key."""
-    work = workplace(method, folder)
+    work = Workplace.at(folder, method.inspect())
+    work.make()
     return work, method.export(TrainingView(clip), work, no_progress)
 
 

@@ -34,8 +34,6 @@ from PIL import Image
 
 PLACE = Path({place!r})
 behaviour = (PLACE / "behaviour.txt").read_text() if (PLACE / "behaviour.txt").exists() else ""
-if os.path.isdir("../model"):
-    print("finds", sorted(os.listdir("../model")))
 
 def options(*names, flags=()):
     parser = argparse.ArgumentParser()
@@ -47,18 +45,12 @@ def options(*names, flags=()):
 
 def train(count, line, step=1):
     # The iterations of a training, each with a line of its output.
-    print("environment", sorted(os.environ))
     for done in range(step, count + 1, step):
         yield done
-        hangs = done == 5 * step and behaviour == "hang"
-        if hangs:
-            child = os.fork()
-            time.sleep(0 if child else 60)
-            (PLACE / "pids.txt").write_text(f"{{os.getpid()}} {{child}}")
         print(line.format(done=done, count=count), flush=True)
         if done == 5 * step and behaviour == "crash":
             raise RuntimeError("CUDA out of memory")
-        time.sleep(60 * hangs)
+        time.sleep(60 * (done == 5 * step and behaviour == "hang"))
 
 def write(path, content):
     if behaviour != "no output":
@@ -94,8 +86,7 @@ GA = """
 from common import *
 arguments = options("source_path", "model_path", "iterations", "iteration", flags=["white_background"])
 source, model = Path(arguments.source_path), Path(arguments.model_path)
-head = read_pickle("flame_model/assets/flame/flame2023.pkl")
-assert head["shapedirs"].shape[2] == 400 and head["posedirs"].shape[-1] == 36
+assert read_pickle("flame_model/assets/flame/flame2023.pkl")["shapedirs"].shape[2] == 400
 made = model / "point_cloud" / f"iteration_{arguments.iterations or arguments.iteration}"
 frames = {split: json.loads((source / f"transforms_{split}.json").read_text())["frames"] for split in ("train", "val", "test")}
 """
@@ -138,15 +129,14 @@ self.face_center_lst = torch.zeros([T, {}, 3], requires_grad=False).cuda()
 """
 
 
-def lip_numbers(head) -> tuple[tuple[list[int], list[int]], tuple[int, int]]:
-    """Vertices on which the stand-in's teeth would hang, which no vertex of the head has, and its vertices and triangles with teeth."""
+def make_repository(folder: Path, head) -> str:
+    """GaussianAvatars' and TGA's.
+
+    The stand-in's teeth would hang on vertices that no vertex of the head has.
+    """
     count, first = len(lip_rings(head)[0]), len(head.template) + 5
-    rings = list(range(first, first + 2 * count, 2)), list(range(first + 1, first + 2 * count, 2))
-    return rings, (max(rings[1]) + 1 + 120, len(head.faces) + 168)
-
-
-def make_repository(folder: Path, rings: tuple[list[int], list[int]], sizes: tuple[int, int]) -> str:
-    """GaussianAvatars' and TGA's, with rings and sizes of `lip_numbers`."""
+    rings = [list(range(start, start + 2 * count, 2)) for start in (first, first + 1)]
+    sizes = max(rings[1]) + 1 + 120, len(head.faces) + 168
     texts = [
         f'self.v.register_buffer(\n    "lip_outside_ring_{name}",\n    torch.tensor([\n {", ".join(map(str, ring))}, \n    ])\n)\n'
         for name, ring in zip(("upper", "lower"), rings)
@@ -171,9 +161,7 @@ from lib.recorder.Recorder import {kind}TrainRecorder
 from lib.trainer.{kind}Trainer import {kind}Trainer
 config = json.loads(Path(sys.argv[2]).read_text())
 data = config["dataset"]
-root, side = Path(data["dataroot"]), data["original_resolution"]
-for place in (root / "images").glob("*/*.jpg"):
-    assert Image.open(place).size == ((256, 256) if "lowres" in place.name else (side, side))
+root = Path(data["dataroot"])
 if behaviour == "crash" and "{kind}".startswith("Gaussian"):
     raise RuntimeError("CUDA out of memory")
 trainer = {kind}Trainer(len(os.listdir(root / "images")), {kind}TrainRecorder(config["recorder"]))
@@ -190,7 +178,6 @@ root, name = Path(data["dataroot"]), config["recorder"]["name"]
 images, parameters = (sorted(root.glob(data[kind])) for kind in ("image_files", "param_files"))
 folder = Path(config["recorder"]["result_path"]) / name
 folder.mkdir(parents=True)
-assert open(config["load_supres_checkpoint"]).read() == open(config["load_gaussianhead_checkpoint"]).read()
 extrinsic, before, size = np.load(data["camera_path"])["extrinsic"], None, data["resolution"]
 place = -extrinsic[:, :3].T @ extrinsic[:, 3]
 for index, at in order(len(images)):
@@ -240,7 +227,7 @@ class MeshHeadTrainer:
 }
 
 
-def make_head_avatar_repository(folder: Path) -> str:
+def make_head_avatar_repository(folder: Path, head) -> str:
     """Gaussian Head Avatar's, with the file that is downloaded."""
     commit = made(folder, GHA_FILES)
     (folder / "assets").mkdir()
@@ -260,10 +247,8 @@ if arguments.version:
     sys.exit()
 config = json.loads((Path("configs/nerf") / arguments.config).read_text())
 config = json.loads((Path("configs/nerf") / config["parent"]).read_text()) | config
-assert config["learning_rate"] == 0.25 and not config["render_novel_trajectory"]
 scene = Path(arguments.scene)
 folder = scene.parent if scene.suffix == ".json" else scene
-assert arguments.no_gui and not os.path.isabs(arguments.scene)
 
 def vertices(path):
     return np.array([line.split()[1:] for line in path.read_text().splitlines() if line.startswith("v")], float)
@@ -277,20 +262,9 @@ debug = folder / "experiments" / Path(arguments.config).stem / "debug"
 for place in (debug.parent.parent, debug.parent, debug):
     place.mkdir(exist_ok=True)
 if not arguments.snapshot:
-    for frame in frames("train"):
-        paths = [folder / frame[name] for name in ("file_path", "seg_mask_path", "depth_path")]
-        assert all(Image.open(path).size == (frame["w"], frame["h"]) for path in paths)
-    print("loads", len(frames("train")), config["max_images_gpu"])
-    try:
-        for done in train(config["max_steps"], "\\x1b[0;35mINFO     \\x1b[0;37miteration={{done}} loss=0.{{done}}\\x1b[0m"):
-            pass
-    except RuntimeError:
-        (debug / "overlay").mkdir()
-        Image.new("RGB", (9, 9)).save(debug / "overlay" / "left.png")
-        raise
+    for done in train(config["max_steps"], "\\x1b[0;35mINFO     \\x1b[0;37miteration={{done}} loss=0.{{done}}\\x1b[0m"):
+        pass
     write(debug / "snapshot.msgpack", b"field")
-else:
-    assert config["render_from_snapshot"] and Path(arguments.snapshot).read_bytes() == b"field"
 (debug / "overlay").mkdir()
 listed, recorded = frames("test"), []
 assert len(listed) <= config["max_images_gpu"]
@@ -306,16 +280,14 @@ for index, at in order(len(listed)) if arguments.snapshot else ():
         image = np.dstack([image, np.full(image.shape[:2], 153, np.uint8)])
     Image.fromarray(image).save(debug / "overlay" / f"{{index:05d}}.png")
     print(f"INFO     Recording frame [{{index + 1}}/{{len(listed)}}] in the mode overlay", flush=True)
-if behaviour == "one too few":
-    recorded = [{{"mesh_path": "", "transform_matrix": frame["transform_matrix"]}} for frame in listed]
 if behaviour != "no cameras":
     (debug / "transforms_overlay.json").write_text(json.dumps({{"frames": recorded}}))
 """
 
 
-def make_insta_repository(folder: Path, masks: str = "v 0 0 0 1 0 0\nf 1 1 1\n") -> str:
-    """INSTA's, built; ``masks`` is the mesh that tells FLAME's topology."""
-    texts = {f"mesh_masks/{name}.obj": masks for name in MASKS}
+def make_insta_repository(folder: Path, head) -> str:
+    """INSTA's, built; its meshes have another topology than FLAME's."""
+    texts = {f"mesh_masks/{name}.obj": "v 0 0 0 1 0 0\nf 1 1 1\n" for name in MASKS}
     texts |= {"configs/nerf/main.json": '{"max_steps": 33000, "learning_rate": 0.25}'}
     commit = made(folder, {".gitignore": "build\n", "src/recorder.cu": "", **texts})
     program = folder / "build" / "rta"
@@ -329,9 +301,7 @@ def make_insta_repository(folder: Path, masks: str = "v 0 0 0 1 0 0\nf 1 1 1\n")
 
 GBS = """
 from common import *
-arguments = options(*("source_path model_path iterations checkpoint_iterations test_iterations load_iteration "
-                      "position_lr_max_steps densify_from_iter densify_until_iter opacity_reset_interval").split())
-assert os.environ["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] == "1"
+arguments = options(*"source_path model_path iterations checkpoint_iterations load_iteration".split())
 source, model = Path(arguments.source_path), Path(arguments.model_path)
 assert read_pickle("data/FLAME2020/generic_model.pkl")["shapedirs"].shape[1:] == (3, 400)
 count = len(list(source.glob("checkpoint/*.frame")))
@@ -340,19 +310,12 @@ images = [Image.open(source / f"images/{number:05d}.png") for number in range(co
 files = ("fix_chkpnt{}.pth", "mouth0_chkpnt{}.pth", "mouth1_chkpnt{}.pth", "acc{}.npy")
 """
 GBS_TRAIN = """
-import random
-print("options", vars(arguments))
-taken = []
-for iteration in train(int(arguments.iterations), "\\rTraining progress:  5%|#| {done}/{count} [00:01<00:10, 5.0it/s, Loss=0.{done}]"):
-    viewpoint_stack = list(range(count - HELD_OUT))
-    taken.append(viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1)))
-print("taken", taken)
+for done in train(int(arguments.iterations), "\\rTraining progress:  5%|#| {done}/{count} [00:01<00:10, 5.0it/s, Loss=0.{done}]"):
+    pass
 for name in files:
     write(model / name.format(arguments.checkpoint_iterations), name.encode())
 """
 GBS_RENDER = """
-for name in files:
-    assert (model / name.format(arguments.load_iteration)).read_bytes() == name.encode()
 folder = model / "seq" / f"split_{arguments.load_iteration}"
 folder.mkdir(parents=True)
 for index, at in order(count):
@@ -367,10 +330,10 @@ for index, at in order(count):
 """
 
 
-def make_blendshapes_repository(folder: Path, vertices: int) -> str:
-    """GaussianBlendshapes', with ``vertices`` of the eyelid bases, which tell FLAME's topology."""
+def make_blendshapes_repository(folder: Path, head) -> str:
+    """GaussianBlendshapes', whose eyelid bases have another topology than the head."""
     texts = {
-        "train.py": GBS + GBS_TRAIN.replace("HELD_OUT", str(HELD_OUT)),
+        "train.py": GBS + GBS_TRAIN,
         "test.py": GBS + GBS_RENDER,
         "FLAME/dataset.py": f"self.n_seg = {HELD_OUT} # held out\n",
         "FLAME/FLAME.py": "",
@@ -378,7 +341,7 @@ def make_blendshapes_repository(folder: Path, vertices: int) -> str:
         **{f"data/{name}_billboard_tri.obj": "v 0 0 0\n" for name in ("up", "down")},
         **{f"data/FLAME2020/{name}.txt": "3\n1\n2\n" for name in ("back_of_head", "neck_exclude_vertex")},
     }
-    return made(folder, texts, {f"FLAME/blendshapes/{side}_eyelid.npy": vertices for side in "lr"})
+    return made(folder, texts, {f"FLAME/blendshapes/{side}_eyelid.npy": 1 for side in "lr"})
 
 
 # ------------------------------------------------------------------ RGBAvatar
@@ -411,16 +374,12 @@ args = options("subject", "work_name", "config", "output_dir", flags=["preload",
 def load_video(config):
     folder = Path(config["data_dir"]) / args.subject
     names = sorted(os.listdir(folder / "images"))
-    assert [name[:5] for name in names] == [name[:5] for name in sorted(os.listdir(folder / "checkpoint"))]
     images = [Image.open(folder / "images" / name) for name in names]
     return [read_frame(folder / f"checkpoint/{name[:5]}.frame") for name in names], images
-
-assert read_pickle("data/FLAME2020/generic_model.pkl")["J_regressor"].todense().shape[0] == 5
 """
 RGB_TRAIN = """
 config = yaml.safe_load(Path(args.config).read_text())
 frames, images = load_video(config)
-assert {image.size for image in images} == {tuple(frames[0]["img_size"])} and args.preload
 output = Path(config["output_dir"]) / args.subject / args.work_name
 output.mkdir(parents=True)
 (output / "config.yaml").write_text(Path(args.config).read_text())
@@ -429,29 +388,17 @@ for done in train(config["train"]["iteration"], "\\rTraining:  5%|#| {done}/{cou
 write(output / "model.ply", b"splats")
 """
 RGB_RENDER = """
-class Tensor:
-    # Values of an image, converted to 8 bits as C does.
-    def __init__(self, values):
-        self.values = values
-
-    def __mul__(self, factor):
-        return Tensor(self.values * factor)
-
-    def clamp(self, low, high):
-        return Tensor(self.values.clip(low, high))
+class Tensor(np.ndarray):
+    clamp = np.ndarray.clip
 
     def to(self, dtype, device):
-        return Tensor(self.values.astype(np.int64) % 256)
-
-    def numpy(self):
-        return self.values.astype(np.uint8)
+        return np.asarray(self.astype(np.int64) % 256, np.uint8)
 
 class torch:
     uint8 = None
 
 output = Path(args.output_dir) / args.subject / args.work_name
 frames, images = load_video(yaml.safe_load((output / "config.yaml").read_text()))
-assert (output / "model.ply").read_bytes() == b"splats" and args.alpha
 K, (width, height) = frames[0]["opencv"]["K"][0], frames[0]["img_size"]
 (output / "render_image").mkdir()
 for index, at in order(len(frames)):
@@ -459,15 +406,15 @@ for index, at in order(len(frames)):
     image = picture([60 + 20 * flame["exp"][0, 0], 60 + 200 * flame["jaw"][0, 5], 60 + 100 * place], width, height, 153) / 1.0
     image[0, 0] = K[0, 0], K[0, 2], 300
     image = np.dstack([image, np.full(image.shape[:2], 153)])
-    image = (Tensor(image / 255) * 255.0).to(dtype=torch.uint8, device='cpu').numpy()
+    image = (image.view(Tensor) / 255 * 255.0).to(dtype=torch.uint8, device='cpu')
     mode = np.ascontiguousarray(image[..., :3] if behaviour == "no coverage" else image)
     Image.fromarray(mode).save(output / "render_image" / f"{index:05d}.png")
     print(f"\\rRendering:  5%|#| {index + 1}/{len(frames)} [00:01<00:10]", end="", file=sys.stderr, flush=True)
 """
 
 
-def make_rgbavatar_repository(folder: Path, vertices: int, triangles: int) -> str:
-    """RGBAvatar's, with the sizes of the head of its texture chart."""
+def make_rgbavatar_repository(folder: Path, head) -> str:
+    """RGBAvatar's, with the sizes of a head."""
     texts = {
         "train_offline.py": RGB + RGB_TRAIN,
         "render.py": RGB + RGB_RENDER,
@@ -476,34 +423,32 @@ def make_rgbavatar_repository(folder: Path, vertices: int, triangles: int) -> st
     texts |= {"dataset/flame_dataset.py": "", "submodules/flame/flame.py": ""}
     chart = folder / "data/FLAME2020/flame_uv.npz"
     chart.parent.mkdir(parents=True)
-    np.savez(chart, vt=np.zeros((3, 2)), ft=np.zeros((triangles, 3), np.uint32))
-    return made(folder, texts, {f"data/FLAME2020/{side}_eyelid.npy": vertices for side in "lr"})
+    np.savez(chart, vt=np.zeros((3, 2)), ft=np.zeros((len(head.faces), 3), np.uint32))
+    return made(folder, texts, {f"data/FLAME2020/{side}_eyelid.npy": len(head.template) for side in "lr"})
 
 
 # ------------------------------------------------------------------ FlashAvatar
 
 FLASH_SCENE = """
-import torch
 from common import *
+
+class torch:
+    zeros = np.zeros
 
 class Scene_mica:
     def __init__(self, datadir, mica_datadir, train_type, white_background):
-        self.bg_image = np.asarray(torch.zeros((3, 512, 512)))
+        self.bg_image = torch.zeros((3, 512, 512))
         self.bg_image[:] = np.reshape([white_background, 1, white_background], (3, 1, 1))
         checkpoints = Path(mica_datadir) / "checkpoint"
         self.N_frames = len(os.listdir(checkpoints))
         test_num = 500
         max_train_num = 10000
         held_out = self.N_frames - test_num
-        assert held_out >= 0
         numbers = list(range(self.N_frames))
         numbers = numbers[:held_out][:max_train_num] if train_type == 0 else numbers[held_out:]
         first = read_frame(checkpoints / "00000.frame")
         self.size, self.K = tuple(first["img_size"]), first["opencv"]["K"][0]
         self.cameras = [self.load(Path(datadir), checkpoints, number) for number in numbers]
-
-    def getCameras(self):
-        return self.cameras
 
     def load(self, folder, checkpoints, number):
         names = ("imgs/%05d.jpg", "alpha/%05d.jpg", "parsing/%05d_neckhead.png", "parsing/%05d_mouth.png")
@@ -514,64 +459,29 @@ class Scene_mica:
             image = self.bg_image.T + mask[..., None] * (image - self.bg_image.T)
         return image, read_frame(checkpoints / ("%05d.frame" % number))
 """
-FLASH_MODEL = """
-class Chart:
-    def __init__(self):
-        self.uv_size = 128
-        self.vertices = len(range(5023))
-        self.uv_vertices_shape, self.uv_head_idx = {(0, "head"): "the neutral mesh"}, "head"
-        self.deformNet = self
-
-    def training_setup(self):
-        pass
-
-    def load_state_dict(self, state):
-        print("starts with", *state, [*state["fcs.0.weight"].shape])
-"""
 FLASH = """
 from common import *
-import random
 import cv2
 from scene import Scene_mica
-from src.deform_model import Chart
-args = options("idname", "image_res", "seed", "iterations", "checkpoint", flags=["white_background"])
+args = options("idname", "image_res", "iterations", "checkpoint", flags=["white_background"])
 args.image_res = int(args.image_res)
-boundary = read_pickle("flame/FLAME_masks/FLAME_masks.pkl")["boundary"]
-vertices, chart = len(read_pickle("flame/generic_model.pkl")["v_template"]), Chart()
-listed = [line for line in open("flame/FlameMesh.obj") if line.startswith("f ")]
-print("chart of", chart.uv_size, "for", len(listed), "triangles without", len(boundary), "of", vertices)
-assert chart.vertices == vertices and os.path.exists("flame/landmark_embedding.npy")
 data, tracked = os.path.join("dataset", args.idname), os.path.join("metrical-tracker/output", args.idname)
 scene = Scene_mica(data, tracked, 1 if args.checkpoint else 0, args.white_background)
 """
 FLASH_TRAIN = """
-import torch
-DeformModel, verts_final = chart, ["the first frame"]
-DeformModel.training_setup()
-gaussians = argparse.Namespace(create_from_verts=lambda points: print("sizes on", points))
-gaussians.create_from_verts(verts_final[0])
 opt = argparse.Namespace(iterations=int(args.iterations))
-print("options", args.seed, len(scene.cameras), "corner", [int(255 * level) for level in scene.cameras[0][0][0, 0]])
 mid_num = 15000
-viewpoint_stack = []
 for iteration in train(opt.iterations, "step: {done}, huber: 0.50000"):
-    if not viewpoint_stack:
-        viewpoint_stack = scene.getCameras().copy()
-    viewpoint_cam = viewpoint_stack.pop(random.randint(0, len(viewpoint_stack)-1))
-    image, shown = viewpoint_cam[0].transpose(2, 0, 1), viewpoint_cam[1]
-    print("draws %.6f" % shown["flame"]["eyelids"][0, 0], np.round(shown["opencv"]["t"][0], 3).tolist())
-    if iteration % 500 == 0 or iteration==1:
+    image = scene.cameras[0][0].transpose(2, 0, 1)
+    if iteration == 1:
         save_image = np.zeros((args.image_res, args.image_res*2, 3))
         save_image[:, :args.image_res, :] = image.transpose(1, 2, 0)
-    if iteration < opt.iterations :
-        print("a step")
     if iteration % 5000 == 0:
         write(Path(data) / "log" / "ckpt" / ("chkpnt" + str(iteration) + ".pth"), b"splats")
 """
 FLASH_TEST = """
 logdir = os.path.join(data, "log")
-assert Path(args.checkpoint).read_bytes() == b"splats"
-out = cv2.VideoWriter(os.path.join(logdir, "test.avi"), 0, 25, (args.image_res * 2, args.image_res), True)
+out = None
 for iteration, at in order(len(scene.cameras)):
     truth, frame = scene.cameras[at]
     levels = [60 + 20 * frame["flame"]["exp"][0, 0], 60 + 200 * frame["flame"]["jaw"][0, 5], scene.K[0, 0]]
@@ -583,19 +493,18 @@ for iteration, at in order(len(scene.cameras)):
     if behaviour == "other size":
         save_image = save_image[1:]
     out.write(save_image)
-out.release()
 """
 FLASH_PLAIN = ("landmark_embedding.npy", "mediapipe/mediapipe_landmark_embedding.npz", "flame_mica.py")
 
 
-def make_flashavatar_repository(folder: Path, vertices: int) -> str:
-    """FlashAvatar's, with ``vertices`` in its mesh."""
+def make_flashavatar_repository(folder: Path, head) -> str:
+    """FlashAvatar's, with the vertices of a head in its mesh."""
+    vertices = len(head.template)
     texts = {
         "train.py": FLASH + FLASH_TRAIN,
         "test.py": FLASH + FLASH_TEST,
-        "torch.py": "import numpy as np\n\ndef zeros(shape):\n    return np.zeros(shape)\n",
         "scene/__init__.py": FLASH_SCENE,
-        "src/deform_model.py": FLASH_MODEL.replace("5023", str(vertices)),
+        "src/deform_model.py": "",
         "flame/FlameMesh.obj": "vt 0 0\nvn 0 0 1\n" + "v 0 0 0\n" * vertices,
         **{f"flame/{name}": "" for name in FLASH_PLAIN},
     }
@@ -630,19 +539,13 @@ def stand_in(method: type) -> type:
 
 
 ADAPTERS = {
-    "ga": (stand_in(GAOfficial), lambda folder, head: make_repository(folder, *lip_numbers(head))),
-    "tga": (stand_in(TGAOfficial), lambda folder, head: make_repository(folder, *lip_numbers(head))),
-    "gbs": (stand_in(GBSOfficial), lambda folder, head: make_blendshapes_repository(folder, 1)),
-    "gha": (stand_in(GHAOfficial), lambda folder, head: make_head_avatar_repository(folder)),
-    "insta": (INSTAOfficial, lambda folder, head: make_insta_repository(folder)),
-    "rgbavatar": (
-        stand_in(RGBAvatarOfficial),
-        lambda folder, head: make_rgbavatar_repository(folder, len(head.template), len(head.faces)),
-    ),
-    "flashavatar": (
-        stand_in(FlashAvatarOfficial),
-        lambda folder, head: make_flashavatar_repository(folder, len(head.template)),
-    ),
+    "ga": (stand_in(GAOfficial), make_repository),
+    "tga": (stand_in(TGAOfficial), make_repository),
+    "gbs": (stand_in(GBSOfficial), make_blendshapes_repository),
+    "gha": (stand_in(GHAOfficial), make_head_avatar_repository),
+    "insta": (INSTAOfficial, make_insta_repository),
+    "rgbavatar": (stand_in(RGBAvatarOfficial), make_rgbavatar_repository),
+    "flashavatar": (stand_in(FlashAvatarOfficial), make_flashavatar_repository),
 }
 """Methods by name, and what writes their repository for a head and returns its commit."""
 

@@ -1,9 +1,8 @@
 """What all adapters have in common: what is checked before any work, given to a program, kept of it, and read back of its renders."""
 
+import json
 import os
-import re
 import shutil
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from headbench.bench.contracts import Budget, ListedFrames, SharingAvatar
+from headbench.bench.contracts import Budget, FrameKey, ListedFrames, SharingAvatar
 from headbench.bench.engine.guard import TrainingView
 from headbench.bench.engine.stored import avatar_digest
 from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json
 from headbench.bench.process import ProgramError
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
-from headbench.methods.official import checkout, needs, spec
+from headbench.methods.official import checkout, needs
 from headbench.methods.official.flashavatar import method as flashavatar
 from headbench.methods.official.gha.export import GHATracking
 from headbench.methods.official.insta import export as insta
@@ -26,9 +25,10 @@ from headbench.methods.official.method import RENDERING, RENDERING_LOG, TRAINING
 from headbench.methods.official.rgbavatar import method as rgbavatar
 from headbench.methods.official.workplace import check_export
 from headbench.methods.shared.avatar_files import Subject
+from headbench.methods.shared.schedule import ShuffledEpochs
 
 from .conftest import OF_VIDEO
-from .helpers import BUDGET, WHITE, export, fit, rendered, renders, views, with_an_odd_size
+from .helpers import BUDGET, WHITE, export, fit, rendered, renders, views
 from .repository import ADAPTERS
 
 every = pytest.mark.parametrize("name", ADAPTERS)
@@ -45,29 +45,8 @@ KEPT = {
     "rgbavatar": "model.ply config.yaml",
     "flashavatar": "chkpnt.pth options.json",
 }
-TOLD = {
-    "ga": ["principal point in the middle of the image: images are cropped accordingly (2 of 3"],
-    "tga": ["jaw bases from training poses", "clusters without random starts"],
-    "gbs": ["placeholders of one pixel", "8 directions is padded"],
-    "gha": ["Basel Face Model"],
-    "insta": ["8 expression coefficients"],
-    "rgbavatar": ["8 directions is padded"],
-    "flashavatar": [
-        "network that parses faces",
-        "principal point",
-        "8 directions",
-        "'test_num = 500' read as",
-    ],
-}
-SEVENTH = {"gha": "loss 0.5000", "rgbavatar": "", "flashavatar": "loss 0.50000", "ga": "loss 0.7"}
+SEVENTH = {"gha": "loss 0.5000", "rgbavatar": "", "flashavatar": "loss 0.50000"}
 """Note of the seventh iteration."""
-LOGGED = {
-    "gbs": "'test_iterations': '0'",
-    "gha": "torch seeded with 0",
-    "insta": "loads 6 1700",
-    "rgbavatar": "train_offline.py --subject head --work_name headbench",
-    "flashavatar": "--idname head --image_res 25 --seed 0 --iterations 20 --white_background",
-}
 
 
 @every
@@ -86,76 +65,69 @@ def test_an_avatar_is_trained_once_and_recorded(name, method, clip, trained):
     assert (frames + 7, frames + 20, SEVENTH.get(name, "loss 0.7")) in calls
     record = read_json(folder / "training.json")
     assert record["official"]["commit"] == method.config.commit
-    assert record["official"]["changed"] == []
-    assert record["leaks"] == []
-    assert all(words in " ".join(record["differences"]) for words in TOLD[name])
+    assert record["official"]["changed"] == record["leaks"] == []
+    assert record["differences"]
     log = (folder / TRAINING_LOG).read_text()
-    assert LOGGED.get(name, "") in log
-    assert re.search("'PATH'", log) or name == "gha"
-    assert not re.search("'(PYTEST|VIRTUAL|PYTHONPATH|OMP)", log)
     fit(method, clip, folder)
     assert (folder / TRAINING_LOG).read_text() == log, "nothing was run"
     with pytest.raises(InputError, match="another run"):
         fit(method, clip, folder, seed=1)
-    assert not [*Path(method.config.checkout).rglob("__pycache__")] or name != "flashavatar"
-
-
-TRAININGS = {
-    name: {"crash": "out of memory", "no output": "no whole avatar"} for name in ADAPTERS if name != "tga"
-}
-TRAININGS["gha"]["stop"] = "ended before its 5 iterations"
-
-
-@pytest.mark.parametrize("name", TRAININGS)
-def test_a_training_that_fails_says_so_and_begins_anew(method, clip, behave, tmp_path, name):
-    """What it left beside its input, renders among it, is none of the images that it may be given."""
-    for fault, expected in TRAININGS[name].items():
-        behave(fault)
-        with pytest.raises(ProgramError, match=expected):
-            fit(method, clip, tmp_path / "a")
-    behave("")
-    calls = []
-    assert fit(method, clip, tmp_path / "a", lambda done, *_: calls.append(done)).files()
-    assert min(calls) > len(clip.splits["train"]), "the export was kept"
 
 
 class Killed(KeyboardInterrupt):
     """What a signal raises."""
 
 
-def alive(pid):
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text()
-    except FileNotFoundError:
-        return False
-    return state.rpartition(")")[2].split()[0] != "Z"
-
-
-@pytest.mark.parametrize("name", ["ga", "rgbavatar"])
-def test_a_training_that_is_killed_or_too_long_ends_its_processes(method, clip, behave, tmp_path, name):
+@pytest.mark.parametrize("name", ["ga"])
+def test_a_training_that_ends_early_begins_anew(method, clip, behave, tmp_path):
+    """It crashes, leaves nothing, is killed or takes too long; the export is kept."""
     frames = len(clip.splits["train"])
 
     def kill(done, total, note=""):
         if done >= frames + 5:
             raise Killed
 
+    for fault, expected in {"crash": "out of memory", "no output": "no whole avatar"}.items():
+        behave(fault)
+        with pytest.raises(ProgramError, match=expected):
+            fit(method, clip, tmp_path / "a")
     behave("hang")
     with pytest.raises(Killed):
         fit(method, clip, tmp_path / "a", kill)
     limited = type(method)(replace(method.config, time_limit_hours=0.5 / 3600))
-    with pytest.raises(ProgramError, match="time limit|time_limit_hours"):
+    with pytest.raises(ProgramError, match="time_limit_hours"):
         fit(limited, clip, tmp_path / "b")
-    pids = (Path(method.config.checkout) / "pids.txt").read_text().split()
-    until = time.monotonic() + 5
-    while any(map(alive, pids)) and time.monotonic() < until:
-        time.sleep(0.02)
-    assert not any(map(alive, pids))
     behave("")
     calls = []
-    fit(method, clip, tmp_path / "a", lambda done, total, note="": calls.append(done))
-    found = re.findall(r"finds (.*)", (tmp_path / "a" / TRAINING_LOG).read_text())
-    assert found == ["[]", "[]"], "nothing of a broken training is left"
-    assert min(calls) > frames, "the export was kept"
+    assert fit(method, clip, tmp_path / "a", lambda done, *_: calls.append(done)).files()
+    assert min(calls) > frames
+
+
+@pytest.mark.parametrize(
+    ("name", "fault", "expected"),
+    [
+        *((name, "no output", "no whole avatar") for name in ("gbs", "gha", "insta", "flashavatar")),
+        ("gha", "stop", "ended before its 5 iterations"),
+        ("gha", "crash", "out of memory"),
+    ],
+)
+def test_a_training_that_fails_says_so(method, clip, behave, tmp_path, fault, expected):
+    behave(fault)
+    with pytest.raises(ProgramError, match=expected):
+        fit(method, clip, tmp_path / "a")
+
+
+@pytest.mark.parametrize("name", ["ga"])
+def test_the_order_may_be_that_of_the_native_method(method, clip, behave, tmp_path):
+    behave("crash")
+    method.config = replace(method.config, order="native")
+    with pytest.raises(ProgramError):
+        fit(method, clip, tmp_path / "a", seed=2)
+    images = read_json(tmp_path / "a" / TRAINING / "exported.json")["images"]
+    keys = {path.rpartition("/")[2]: FrameKey(*key) for path, key in images.items()}
+    train, sampler = clip.splits["train"], ShuffledEpochs(len(images), 2)
+    found = [keys[name] for name in read_json(tmp_path / "a" / TRAINING / "launch.json")["order"]]
+    assert found == [train[sampler(i)] for i in range(1, BUDGET.iterations + 1)]
 
 
 # ------------------------------------------------------------------ what a program is given
@@ -174,10 +146,8 @@ def test_training_frames_alone_are_exported(name, method, clip, tmp_path):
     with pytest.raises(HeadbenchError, match="not a training frame"):
         TrainingView(clip).image(held_out)
     first, second = sorted(images)[:2]
-    for wrong in (
-        {first: held_out},
-        {first: images[second]} if images[first] != images[second] else {"a.png": keys[0]},
-    ):
+    other = {first: images[second]} if images[first] != images[second] else {"a.png": keys[0]}
+    for wrong in ({first: held_out}, other):
         with pytest.raises(InputError):
             check_export(work, images | wrong, clip)
     shutil.copyfile(work.root / first, work.program / "test.JPG")
@@ -185,7 +155,7 @@ def test_training_frames_alone_are_exported(name, method, clip, tmp_path):
         check_export(work, images, clip)
     (work.program / "test.JPG").unlink()
     (work.root / first).unlink()
-    with pytest.raises(InputError, match=re.escape(first)):
+    with pytest.raises(InputError, match=first):
         check_export(work, images, clip)
 
 
@@ -222,25 +192,27 @@ def corner_of(name, clip, camera, pose):
 
 @every
 def test_frames_come_back_under_their_keys(name, avatar, clip, tmp_path, monkeypatch):
-    for module in (rgbavatar, flashavatar, insta):
-        monkeypatch.setattr(
-            module, "PART", 4 if module is insta else 8
-        )  # more than one call for a camera's frames
-    wanted, several = views(clip, "novel_view", "self_reenactment", "train"), name in (*OF_VIDEO, "insta")
-    wanted, before = with_an_odd_size(wanted) if several else wanted, avatar_digest(tmp_path / "avatar")
-    for ground in (WHITE, GREEN)[: 1 + (name in COVERED)]:
-        found = rendered(avatar, wanted, ground)
-        for key, (camera, pose) in wanted.items():
-            rgb, alpha = found[key]
-            most, share = (153, 0.4) if name in COVERED else (255, 0.0)
-            assert alpha == pytest.approx(1 - share)
-            levels = np.clip(levels_of(name, clip, key, camera, pose), 0, most)
-            pixels = [(rgb[1, 1], levels), (rgb[-1, -1], levels)]
-            if name in ("insta", "rgbavatar"):
-                pixels.append((rgb[0, 0], corner_of(name, clip, camera, pose)))
-            for pixel, shown in pixels:
-                expected = np.clip(np.floor(shown) / 255 + share * np.array(ground), 0, 1)
-                assert np.abs(pixel - expected).max() < 1.01 / 255
+    for module in (rgbavatar, flashavatar, insta):  # more than one call for a camera's frames
+        monkeypatch.setattr(module, "PART", 4 if module is insta else 8)
+    wanted, before = (
+        views(clip, "novel_view", "self_reenactment", "train"),
+        avatar_digest(tmp_path / "avatar"),
+    )
+    if name in (*OF_VIDEO, "insta"):
+        odd, (camera, pose) = next(iter(wanted.items()))
+        wanted[odd] = replace(camera, width=30), pose
+    ground, most, share = (GREEN, 153, 0.4) if name in COVERED else (WHITE, 255, 0.0)
+    found = rendered(avatar, wanted, ground)
+    for key, (camera, pose) in wanted.items():
+        rgb, alpha = found[key]
+        assert alpha == pytest.approx(1 - share)
+        levels = np.clip(levels_of(name, clip, key, camera, pose), 0, most)
+        pixels = [(rgb[1, 1], levels), (rgb[-1, -1], levels)]
+        if name in ("insta", "rgbavatar"):
+            pixels.append((rgb[0, 0], corner_of(name, clip, camera, pose)))
+        for pixel, shown in pixels:
+            expected = np.clip(np.floor(shown) / 255 + share * np.array(ground), 0, 1)
+            assert np.abs(pixel - expected).max() < 1.01 / 255
     assert not (tmp_path / "avatar" / RENDERING).exists()
     assert {path.name for path in (tmp_path / "avatar").glob("*.log")} == {TRAINING_LOG, RENDERING_LOG}
     assert avatar_digest(tmp_path / "avatar") == before, "logs are no part of an avatar"
@@ -251,82 +223,71 @@ def test_frames_come_back_under_their_keys(name, avatar, clip, tmp_path, monkeyp
             renders(avatar, clip, BLACK)
 
 
-SIZE, MEMORY = r"expected \d+x\d+ pixels, found \d+x\d+", "exit code 1.*out of memory"
-LISTS = {
-    "ga": {"other size": SIZE, "reversed": "the mark of frame", "one too few": r"first 00001.png \(toy/"},
-    "gbs": {
-        "no coverage": "pred_mask_00000.png",
-        "reversed": "the mark of frame 0",
-        "one too few": r"first pred_00001.png \(toy/",
+MARK, CAMERA, SIZE = "the mark of frame", "rendered by the camera of another", "expected .* pixels"
+RENDERS = {
+    "ga": {
+        "crash in rendering": "exit code 1.*out of memory",
         "other size": SIZE,
+        "reversed": MARK,
+        "one too few": "first 00001.png",
     },
-    "gha": {"reversed": "the mark of frame", "one too few": r"first 000001.png \(toy/"},
-    "insta": {
-        "no coverage": "colours and coverage",
-        "other size": SIZE,
-        "reversed": "exit code 1.*rendered by the camera of another",
-        "no cameras": "exit code 1.*wrote no .*transforms_overlay.json",
-        "one too few": r"first 000001.png \(toy/",
-    },
-    "rgbavatar": {"no coverage": "coverage", "other size": SIZE, "one too few": r"first 000001.png \(toy/"},
-    "flashavatar": {
-        "other size": SIZE,
-        "reversed": "the mark of frame 0",
-        "one too few": r"first 000001.png \(toy/",
-    },
+    "gbs": {"no coverage": "pred_mask_00000.png", "reversed": MARK},
+    "gha": {"reversed": MARK},
+    "insta": {"no coverage": "colours and coverage", "reversed": CAMERA, "no cameras": "transforms_overlay"},
+    "rgbavatar": {"no coverage": "coverage", "one too few": "first 000001.png"},
+    "flashavatar": {"other size": SIZE, "reversed": MARK},
 }
 
 
-@pytest.mark.parametrize("name", LISTS)
+@pytest.mark.parametrize("name", RENDERS)
 def test_renders_that_are_not_what_was_listed_are_found(avatar, clip, behave, name):
-    for fault, expected in ({"crash in rendering": MEMORY} | LISTS[name]).items():
+    for fault, expected in RENDERS[name].items():
         behave(fault)
         with pytest.raises(ProgramError, match=expected):
             renders(avatar, clip)
 
 
+@pytest.mark.parametrize("name", ["ga"])
+def test_folders_may_be_relative(method, clip, avatar, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    method.config = replace(method.config, checkout=os.path.relpath(method.config.checkout))
+    assert renders(method.load(Path("avatar"), device="cpu"), clip)
+
+
 # ------------------------------------------------------------------ settings
 
-NO_SHIM = ("gha", "insta")
-URLS = {"insta": "Zielon/INSTA", "rgbavatar": "gapszju/RGBAvatar", "flashavatar": "USTC3DV/FlashAvatar-code"}
-SETTINGS = [
-    *((name, {"device": "cpu-shim"}, "device: expected cuda") for name in NO_SHIM),
-    *((name, {"order": "native"}, "order: expected published") for name in NO_SHIM),
-    *((name, {"python": ""}, f"settings.{name}-official.python=") for name in OF_VIDEO),
-    *((name, {"commit": "0" * 40}, "expected commit 000000000000, found commit") for name in URLS),
-    *((name, {"checkout": "/nowhere"}, f"no such folder.*git clone.*{url}") for name, url in URLS.items()),
-    ("insta", {"program": "build/none"}, "build/none.*program: expected.*cmake"),
-    ("insta", {"program": "no-such-program build/rta"}, "no-such-program"),
-    ("insta", {"program": "'unclosed"}, "the program that was built"),
-    ("insta", {"program": "/bin/true"}, "to --version.*cmake"),
+FAULTS = [
+    *((name, {"device": "cpu-shim"}, "device") for name in ("gha", "insta")),
+    *((name, {"order": "native"}, "order") for name in ("gha", "insta")),
+    *((name, {"python": ""}, f"settings.{name}-official.python") for name in OF_VIDEO),
+    *((name, {"commit": "0" * 40}, "commit") for name in ADAPTERS),
+    *((name, {"checkout": "/nowhere"}, "checkout.*git clone") for name in ADAPTERS),
+    *(("insta", {"program": program}, "program") for program in ("build/none", "'unclosed", "/bin/true")),
 ]
 
 
-@pytest.mark.parametrize(("name", "changes", "expected"), SETTINGS)
+@pytest.mark.parametrize(("name", "changes", "expected"), FAULTS)
 def test_faults_of_settings_are_named_before_any_work(method, clip, changes, expected):
     method.config = replace(method.config, **changes)
     with pytest.raises(InputError, match=expected):
         method.check(clip, BUDGET)
 
 
-@pytest.mark.parametrize(
-    ("name", "changes"),
-    [
-        *(
-            ("gha", wrong)
-            for wrong in ({"mesh_fraction": 0.0}, {"mesh_fraction": 1.0}, {"arguments": ("-x",)})
-        ),
-        *(("insta", wrong) for wrong in ({"python": "python"}, {"images_on_gpu": 0})),
-        *(("rgbavatar", {"values": (value,)}) for value in ("tex_size", "iteration=5")),
-        ("ga", {"time_limit_hours": 0.0}),
-    ],
-)
+MEANINGLESS = [
+    *(("gha", wrong) for wrong in ({"mesh_fraction": 0.0}, {"mesh_fraction": 1.0}, {"arguments": ("-x",)})),
+    *(("insta", wrong) for wrong in ({"python": "python"}, {"images_on_gpu": 0})),
+    *(("rgbavatar", {"values": (value,)}) for value in ("tex_size", "iteration=5")),
+    ("ga", {"time_limit_hours": 0.0}),
+]
+
+
+@pytest.mark.parametrize(("name", "changes"), MEANINGLESS)
 def test_settings_without_a_meaning_are_refused(name, changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
         ADAPTERS[name][0].config_class(**changes)
 
 
-@every
+@pytest.mark.parametrize("name", ["ga"])
 def test_budgets_in_seconds_are_refused(method, clip, tmp_path):
     for budget in (Budget(seconds=5.0), Budget(iterations=5, seconds=5.0)):
         with pytest.raises(InputError, match="seconds"):
@@ -351,30 +312,11 @@ def test_doctor_misses_a_gpu(method, monkeypatch, name, remedy):
     monkeypatch.setattr(checkout, "_DEVICES", "print('headbench-devices', 0)")
     monkeypatch.setitem(needs.METHODS, type(method.config), type(method))
     if name != "insta":
-        monkeypatch.setattr(type(method), "repository", replace(method.repository, modules=("torch",)))
+        probed = {"python": "3", "missing": {}, "failed": "", "torch": "2", "cuda": False}
+        monkeypatch.setattr(checkout, "_answer", lambda *_: (f"headbench-probe {json.dumps(probed)}", ""))
     (_, environment) = needs.official(method.config, "cpu")
     assert remedy in environment.remedy
     assert "cpu-shim" not in environment.remedy, "the shim does not support this code"
-
-
-def test_presets_and_head_models_are_those_of_the_publications():
-    of_video = [spec.GBS_OFFICIAL, spec.INSTA_OFFICIAL, spec.RGBAVATAR_OFFICIAL, spec.FLASHAVATAR_OFFICIAL]
-    for each in of_video:
-        assert each.monocular
-        assert set(each.presets) == {"smoke", "demo", "fast", "paper"}
-    assert [each.head_models for each in of_video[2:]] == [("flame2020",)] * 2
-    assert spec.FLASHAVATAR_OFFICIAL.presets["paper"]["budget"] == {"iterations": 150_000}
-    demo = spec.GBS_OFFICIAL.presets["demo"]
-    assert demo["budget"] == {"iterations": 2_000}
-    assert demo["arguments"][-2:] == ("--init_face_point_number", "12000")
-    assert "arguments" not in spec.GBS_OFFICIAL.presets["paper"]
-
-
-@pytest.mark.parametrize("name", ["ga"])
-def test_folders_may_be_relative(method, clip, avatar, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    method.config = replace(method.config, checkout=os.path.relpath(method.config.checkout))
-    assert renders(method.load(Path("avatar"), device="cpu"), clip)
 
 
 # ------------------------------------------------------------------ clips
@@ -388,11 +330,11 @@ def without(region, clip):
     return of_head(clip, regions={name: part for name, part in clip.head.regions.items() if name != region})
 
 
-def of_camera(name, row, column, change, clip):
+def of_camera(name, row, column, factor, more, clip):
     """With another value in a camera's K."""
     camera = clip.cameras[name]
     K = camera.K.copy()
-    K[row, column] = change(K[row, column])
+    K[row, column] = factor * K[row, column] + more
     return replace(clip, cameras={**clip.cameras, name: replace(camera, K=K)})
 
 
@@ -404,21 +346,9 @@ def grounded(level, clip):
     return replace(clip, background=np.full(3, level))
 
 
-def no_mask(clip):
-    return replace(clip, masks=dict.fromkeys(clip.masks))
-
-
-def widened(value):
-    return 1.05 * value
-
-
-def skewed(name):
-    return partial(of_camera, name, 0, 1, lambda value: value + 1)
-
-
-INTRINSICS = (partial(of_camera, "01", 0, 0, widened), "camera 01")
-PIXELS = (partial(of_camera, "02", 1, 1, widened), "square pixels")
-MASK = (no_mask, "a mask")
+MASK = (lambda clip: replace(clip, masks=dict.fromkeys(clip.masks)), "a mask")
+INTRINSICS = (partial(of_camera, "01", 0, 0, 1.05, 0), "camera 01")
+PIXELS = (partial(of_camera, "02", 1, 1, 1.05, 0), "square pixels")
 BASIS = (
     lambda clip: of_head(clip, expression_basis=np.zeros((len(clip.head.template), 3, 101))),
     "expression basis",
@@ -435,19 +365,20 @@ CLIPS = {
     ],
     "gha": [
         *((partial(grounded, 0.0), "background"), (partial(without, "lips"), "region 'lips'")),
-        *((partial(of_train, slice(1, None)), "timestep"), (skewed("02"), "camera 02")),
+        (partial(of_train, slice(1, None)), "timestep"),
+        (partial(of_camera, "02", 0, 1, 1, 1), "camera 02"),
     ],
     "insta": [
-        *(MASK, (skewed("00"), "no skew")),
+        *(MASK, (partial(of_camera, "00", 0, 1, 1, 1), "no skew")),
         (lambda clip: replace(clip, static_offset=clip.static_offset + [0, 0.5, 0]), "template"),
     ],
     "rgbavatar": [
-        *(MASK, BASIS, INTRINSICS, (skewed("02"), "no skew")),
+        *(MASK, BASIS, INTRINSICS, (partial(of_camera, "02", 0, 1, 1, 1), "no skew")),
         (partial(of_train, slice(9)), "10 training frames or more.*found 9"),
     ],
     "flashavatar": [
         *(MASK, INTRINSICS, PIXELS, (partial(grounded, 0.0), "background")),
-        (partial(without, "boundary"), r"regions\[boundary\].*FLAME_masks.pkl"),
+        (partial(without, "boundary"), r"regions\[boundary\]"),
     ],
 }
 

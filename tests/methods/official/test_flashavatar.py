@@ -1,25 +1,18 @@
 """FlashAvatar's adapter: images, masks and numbers that their loader reads, texts changed, renders read back by key."""
 
-import re
 import sys
 import tempfile
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from headbench.bench.errors import InputError
-from headbench.bench.io.documents import read_json
 from headbench.bench.io.images import read_pixels
-from headbench.bench.process import ProgramError
-from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
+from headbench.datasets.head.subject import pose_in_head_frame
 from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.flashavatar.method import FlashAvatarTraining
 from headbench.methods.flashavatar.model import layer_of_points, network_outputs
-from headbench.methods.official import checkout, needs
-from headbench.methods.official.config import FlashAvatarOfficialConfig
 from headbench.methods.official.flashavatar.export import (
     ParsingMasks,
     chart_of_points,
@@ -29,31 +22,16 @@ from headbench.methods.official.flashavatar.export import (
     native_network,
     native_points,
 )
-from headbench.methods.official.flashavatar.method import FLASHAVATAR_REPOSITORY, SHRINK, SPLATS
+from headbench.methods.official.flashavatar.method import SHRINK, SPLATS
 from headbench.methods.official.ga.windows import inside
-from headbench.methods.official.method import RENDERING_LOG, TRAINING_LOG
 from headbench.methods.official.shim.meshes import Mesh, load_obj, rasterize_meshes
 from headbench.methods.official.surface import VisibleMesh
 from headbench.methods.official.video import training_frames
 from headbench.methods.shared.avatar_files import Subject
-from headbench.methods.shared.schedule import ShuffledEpochs
 
-from ..flashavatar.small import SMALL
-from .helpers import BUDGET, WHITE, check_tracked, export, fit, read_tracked, rendered, renders, views
+from .helpers import check_tracked, read_tracked
 
 NAME = "flashavatar"
-
-
-def test_a_green_background_is_that_of_their_default(method, video_clip, tmp_path):
-    green = np.array([0.0, 1.0, 0.0])
-    clip = replace(video_clip, background=green)
-    avatar = fit(method, clip, tmp_path / "a")
-    log = (tmp_path / "a" / TRAINING_LOG).read_text()
-    assert "--white_background" not in log
-    assert "corner [0, 255, 0]" in log
-    with pytest.raises(InputError, match="background that it was trained on"):
-        renders(avatar, clip, WHITE)
-    assert renders(avatar, clip, tuple(green))
 
 
 def test_frames_begin_with_0_and_images_with_1(exported, video_clip):
@@ -133,81 +111,6 @@ def test_masks_of_head_and_mouth_are_those_of_the_mesh(method, video_clip):
     assert counts.min() > 10
 
 
-def test_native_masks_are_those_of_the_native_method(method, video_clip, tmp_path):
-    method = type(method)(replace(method.config, masks="native"))
-    work, images = export(method, video_clip, tmp_path / "work")
-    training = FlashAvatarTraining(video_clip, FlashAvatarConfig(**SMALL), "cpu", 0)
-    pixels = 0
-    for number in range(len(images) // 4):
-        key = images[f"program/{image_names('head', number)[0]}"]
-        window = inside(video_clip.cameras[key.camera])
-        _, alpha, head, mouth = (read_pixels(work.program / name) for name in image_names("head", number))
-        expected = window.cut(training._mask(training.keys.index(key)).numpy().astype(np.uint8))
-        assert np.array_equal(mouth, 255 * expected)
-        assert np.array_equal(head, 255 * (alpha > 0))
-        pixels += int(expected.sum())
-    assert pixels > 10
-    (remark,) = [line for line in method.differences(video_clip, 0) if line.startswith("masks")]
-    assert remark.endswith("masks of the mouth are those of the native method")
-
-
-def test_mesh_and_sources_are_theirs(exported, method):
-    work, _ = exported
-    for name in ("flame/FlameMesh.obj", "scene/__init__.py", "train.py"):
-        assert (work.program / name).read_bytes() == (Path(method.config.checkout) / name).read_bytes()
-
-
-# ------------------------------------------------------------------ the CPU shim
-
-
-@pytest.fixture
-def shimmed(method, repository):
-    """The method on a CPU, with the native method's order, and a checkout whose mesh is not that of the clip's head."""
-    path = repository[0] / "flame/FlameMesh.obj"
-    path.write_text(path.read_text() + "v 0 0 0\n")
-    (repository[0] / "torch.py").unlink()  # the shim needs the real one
-    return type(method)(replace(method.config, device="cpu-shim", order="native", samples=200))
-
-
-def test_another_topology_has_a_chart_of_its_own(shimmed, repository, video_clip, tmp_path):
-    avatar = fit(shimmed, video_clip, tmp_path / "a", seed=1)
-    log = (tmp_path / "a" / TRAINING_LOG).read_text()
-    points = native_points(Subject.of(video_clip), video_clip.head, 200, 1)
-    count, vertices = len(points.triangles), len(video_clip.head.template)
-    assert f"chart of 16 for {count} triangles without 0 of {vertices}" in log
-    assert "sizes on the first frame" in log
-    assert "starts with" not in log
-    # Eyelids and cameras of each image that was drawn, against the order of the native method.
-    keys = video_clip.splits["train"]
-    frames = {f.key: f for f in training_frames(video_clip, PosedSubject.of(video_clip))}
-    sampler = ShuffledEpochs(len(keys), 1)
-    drawn = re.findall(r"^draws ([\d.]+) \[([^]]*)\]", log, re.MULTILINE)
-    assert len(drawn) == 20
-    assert log.count("a step") == 19  # as the native method, which takes no step in the last iteration
-    for iteration, (lids, place) in enumerate(drawn, start=1):
-        frame = frames[keys[sampler(iteration)]]
-        camera = inside(frame.camera).camera
-        assert float(lids) == pytest.approx(frame.pose.eyelids[0], abs=1e-6)
-        assert [float(v) for v in place.split(",")] == pytest.approx(camera.world_to_camera[:3, 3], abs=1e-3)
-    told = " ".join(read_json(tmp_path / "a" / "training.json")["differences"])
-    for word in ("cpu-shim", "native method draws", "another topology", "'self.uv_size = 128' read as"):
-        assert word in told
-    wanted = views(video_clip, "novel_view")
-    rendered(avatar, wanted)
-    assert f"for {count} triangles" in (tmp_path / "a" / RENDERING_LOG).read_text()
-
-
-def test_the_start_may_be_the_native_methods(shimmed, video_clip, tmp_path):
-    native = type(shimmed)(replace(shimmed.config, start="native"))
-    fit(native, video_clip, tmp_path / "b")
-    found = (tmp_path / "b" / TRAINING_LOG).read_text()
-    assert "sizes on the neutral mesh" in found
-    layers = [*(f"fcs.{layer}" for layer in range(6)), "output_linear"]
-    names = [f"{layer}.{part}" for part in ("weight", "bias") for layer in layers]
-    assert f"starts with {' '.join(names)} [256, 171]" in found
-    assert "network starts as the native" in " ".join(read_json(tmp_path / "b/training.json")["differences"])
-
-
 def test_their_network_at_the_start_is_the_native_one(method, video_clip):
     """By a plain network of their layers, with the inputs that are exported for a frame."""
     training = FlashAvatarTraining(video_clip, FlashAvatarConfig(samples=100), "cpu", 3)
@@ -252,60 +155,6 @@ def test_a_chart_of_points_has_them_as_its_texels(video_clip):
     assert np.abs(barycentric.view(-1, 3)[hit].numpy() - weights).max() < 2e-4
     with pytest.raises(InputError, match="at most 256, as many as texels"):
         chart_of_points(np.asarray(head.template), faces, weights, 16)
-
-
-def test_flame_s_topology_keeps_their_chart(method, repository, video_clip, tmp_path):
-    (repository[0] / "torch.py").unlink()
-    shimmed = type(method)(replace(method.config, device="cpu-shim"))
-    fit(shimmed, video_clip, tmp_path / "a")
-    border = len(video_clip.head.regions["boundary"])
-    log = (tmp_path / "a" / TRAINING_LOG).read_text()
-    assert f"chart of 128 for 0 triangles without {border} of" in log
-
-
-def test_runs_with_their_perceptual_loss_are_refused_on_a_cpu(shimmed, video_clip):
-    shimmed.check(video_clip, replace(BUDGET, iterations=15_000))
-    with pytest.raises(InputError, match="at most 15000 with device=cpu-shim, which has no perceptual loss"):
-        shimmed.check(video_clip, replace(BUDGET, iterations=15_001))
-
-
-# ------------------------------------------------------------------ what happens where it fails
-
-
-@pytest.mark.parametrize(
-    ("file", "expected"),
-    {
-        "flame/FlameMesh.obj": "FlameMesh.obj has.*Refit the capture to FLAME 2020",
-        "scene/__init__.py": "at most 7 training frames",
-    }.items(),
-)
-def test_limits_of_their_files_are_kept(method, repository, video_clip, file, expected):
-    path = repository[0] / file
-    path.write_text(path.read_text().replace("max_train_num = 10000", "max_train_num = 7") + "\nv 0 0 0\n")
-    with pytest.raises(InputError, match=expected):
-        method.check(video_clip, BUDGET)
-
-
-def test_missing_weights_are_named_before_any_work(method, video_clip, tmp_path, monkeypatch, answers):
-    monkeypatch.setattr(checkout, "_answer", answers.ask)  # which changes with the file
-    whole = replace(FLASHAVATAR_REPOSITORY, modules=("torch",))
-    monkeypatch.setattr(type(method), "repository", whole)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
-    with pytest.raises(InputError, match=r"No such file.*vgg16-397923af\.pth.*VGG's weights: run python -c"):
-        method.check(video_clip, BUDGET)
-    weights = tmp_path / "hub/hub/checkpoints/vgg16-397923af.pth"
-    weights.parent.mkdir(parents=True)
-    weights.write_bytes(b"")
-    monkeypatch.setitem(needs.METHODS, FlashAvatarOfficialConfig, type(method))
-    (_, environment) = needs.official(method.config, "cpu")
-    assert "CUDA build of PyTorch" in environment.remedy or environment.found
-
-
-def test_another_source_than_that_of_the_commit_is_refused(method, repository, video_clip, tmp_path):
-    path = repository[0] / "scene/__init__.py"
-    path.write_text(path.read_text().replace("test_num = 500", "test_num = 400"))
-    with pytest.raises(ProgramError, match="expected .test_num = 500., found none"):
-        fit(method, video_clip, tmp_path / "a")
 
 
 def test_checkpoints_lose_their_optimisers_and_nothing_else(tmp_path, monkeypatch, capsys):

@@ -1,35 +1,19 @@
 """INSTA's adapter: the video that its program reads, where that may lie, renders on black read back by key."""
 
-import json
-from dataclasses import replace
-
 import cv2
 import numpy as np
-import pytest
 
 from headbench.bench.io.documents import read_json
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
 from headbench.datasets.monocular.mesh_fit import read_vertices
-from headbench.methods.official.config import INSTAOfficialConfig
-from headbench.methods.official.insta import export
-from headbench.methods.official.insta.export import HAIR, MOUTH, SKIN, VideoMesh
-from headbench.methods.official.insta.method import INSTAOfficial
-from headbench.methods.official.workplace import Listed
-from headbench.methods.shared.avatar_files import Subject
+from headbench.methods.official.insta.export import HAIR, MOUTH, SKIN
 
-from .helpers import pixels_of, views, workplace
-from .repository import make_insta_repository
+from .helpers import pixels_of
 
 NAME = "insta"
 
 
-def test_words_may_start_the_program(method):
-    program = f"env A=1 '{method.config.checkout}/build/rta'"
-    found = INSTAOfficial(replace(method.config, program=program)).inspect()
-    assert found.python[1:] == ("A=1", f"{method.config.checkout}/build/rta")
-
-
-def test_the_test_split_is_a_pixel_and_equal_meshes_are_written_once(exported):
+def test_equal_meshes_are_written_once(exported):
     work, images = exported
     (last,) = read_json(work.input / "transforms_test.json")["frames"]
     assert cv2.imread(str(work.input / last["file_path"]), -1).tolist() == [[[0, 0, 0, 0]]]
@@ -84,44 +68,3 @@ def test_depth_and_classes_are_those_of_the_mesh(exported, official_clip):
         column, row = (focal * nearest[:2] / nearest[2] + center).astype(int)
         if mask[row, column]:
             assert abs(depth[row, column] / 1000 - nearest[2]) < 0.01
-
-
-def test_a_head_of_flames_topology_keeps_their_triangles(official_clip, tmp_path):
-    count = len(official_clip.head.template)
-    text = "v 0 0 0 1 0 0\n" * count + "f 1//1 2//2 3//3\n"
-    commit = make_insta_repository(tmp_path / "repository", text)
-    method = INSTAOfficial(INSTAOfficialConfig(str(tmp_path / "repository"), commit=commit))
-    mesh = VideoMesh.of(Subject.of(official_clip), official_clip.head, method.inspect())
-    assert mesh.is_flames
-    assert mesh.faces.tolist() == [[0, 1, 2]]
-    mesh.write_masks(tmp_path)
-    assert (tmp_path / "mesh_masks/face.obj").read_text() == text
-
-
-def test_regions_of_another_head_are_red_vertices(method, official_clip, tmp_path):
-    head = official_clip.head
-    mesh = VideoMesh.of(Subject.of(official_clip), head, method.inspect())
-    assert not mesh.is_flames
-    mesh.write_masks(tmp_path)
-    seen = np.zeros(len(head.template), int)
-    for name, regions in export.MASKS.items():
-        lines = (tmp_path / "mesh_masks" / f"{name}.obj").read_text().splitlines()
-        red = np.array([line.split()[4:] == ["1", "0", "0"] for line in lines if line.startswith("v ")])
-        seen += red
-        members = np.concatenate([head.regions.get(region, np.array([], int)) for region in regions])
-        assert set(np.flatnonzero(red)) <= set(members.tolist())
-    assert seen.max() == 1
-
-
-def test_a_list_has_focal_lengths_for_images_of_a_pixel(method, official_clip, tmp_path):
-    work = workplace(method, tmp_path / "work")
-    mesh = VideoMesh.of(Subject.of(official_clip), official_clip.head, method.inspect())
-    wanted = views(official_clip, "novel_view", "train")
-    frames = [Listed(7 + i, key, *view) for i, (key, view) in enumerate(wanted.items())]
-    (part,) = export.write_list(frames, mesh, work)
-    assert part["numbers"] == [frame.number for frame in frames]
-    document = json.loads((work.input / part["folder"] / "transforms_test.json").read_text())
-    for frame, listed in zip(document["frames"], frames, strict=True):
-        K = listed.camera.K
-        assert [36 * frame[name] for name in ("fl_x", "fl_y")] == pytest.approx([K[0, 0], K[1, 1]])
-        assert [frame[name] for name in ("cx", "cy", "w", "h")] == [K[0, 2], K[1, 2], 28, 36]

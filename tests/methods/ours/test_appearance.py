@@ -28,23 +28,6 @@ def test_lines_start_after_their_iteration_and_within_their_box(clip):
     assert after.penalty > 0
 
 
-def test_opacity_branch_is_detached_from_positions(clip):
-    appearance, optimiser, binding = make(clip)
-    shading = place(clip, appearance, optimiser, binding, 60_001)
-    (shading.opacities.sum() + shading.penalty).backward()
-    assert optimiser["means"].grad is None
-    assert optimiser["lines"].grad.abs().sum() > 0
-    assert optimiser["opacities"].grad.abs().sum() > 0
-
-
-def test_colour_branch_moves_positions(clip):
-    appearance, optimiser, binding = make(clip)
-    place(clip, appearance, optimiser, binding, 1).colors.sum().backward()
-    assert optimiser["means"].grad.abs().sum() > 0
-    assert optimiser["plane_xy"].grad.abs().sum() > 0
-    assert optimiser["lines"].grad is None
-
-
 def test_face_bounds_reach_fewer_splats_than_head_bounds(clip):
     moved = {}
     for bounds in ("head", "face"):

@@ -15,9 +15,8 @@ from headbench.bench.engine.stored import TRAINING_FILE
 from headbench.methods.ours.capacity import plan_capacity
 from headbench.methods.ours.config import Lines, OursConfig, Penalty, PlannedCapacity
 from headbench.methods.ours.method import Ours
-from headbench.methods.shared.avatar_files import Subject
+from headbench.methods.shared.avatar_files import clip_mesh
 from headbench.methods.shared.config import SplatTraining
-from headbench.methods.shared.subject_mesh import SubjectMesh
 
 from .toy import changed
 
@@ -32,13 +31,8 @@ MEGAPIXEL = 40
 """Enlarges the toy's cameras so that its millimetres are pixels."""
 
 
-def mesh_of(clip):
-    subject = Subject.of(clip)
-    return SubjectMesh(clip.head, subject.shape, subject.static_offset, "cpu")
-
-
 def plan(clip, config=SMALL):
-    return plan_capacity(clip, mesh_of(clip), config)
+    return plan_capacity(clip, clip_mesh(clip, "cpu"), config)
 
 
 def chosen(clip, config=SMALL):
@@ -105,7 +99,7 @@ def test_motion_that_no_pixel_shows_is_none(clip):
 def test_lines_reach_no_further_than_what_moves(sharp):
     found = plan(sharp)
     low, high = map(np.array, found.lines_within)
-    canonical = mesh_of(sharp).canonical.numpy()
+    canonical = clip_mesh(sharp, "cpu").canonical.numpy()
     assert (low >= canonical.min(0) - 1e-7).all()
     assert (high <= canonical.max(0) + 1e-7).all()
     strict = plan(sharp, changed(SMALL, penalty={"face_mm": 6.0, "other_mm": 6.0}))

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from headbench.bench.contracts import FrameKey
-from headbench.bench.engine.guard import TrainingView
 from headbench.datasets.synthetic.plan import FRONTAL, SyntheticSettings, load_geometry, plan_subject
 from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
@@ -23,10 +22,13 @@ from headbench.methods.shared.subject_mesh import SubjectMesh
 from ..toy_clip import ToyClip, splat_pictures
 
 OURS = OursConfig(capacity=PlannedCapacity("auto"))
-TRACKERS = [
-    *(("video", 3.0), ("per-frame", 1.0)),
-    *(pytest.param(*tracker, marks=pytest.mark.slow) for tracker in (("video", 1.0), ("per-frame", 3.0))),
-]
+
+
+def trackers(usual):
+    """All trackers with their error; those but the usual one are tried in nightly runs."""
+    others = {("video", 1.0), ("video", 3.0), ("per-frame", 1.0), ("per-frame", 3.0)} - {usual}
+    more = [pytest.param(*other, marks=pytest.mark.slow) for other in sorted(others)]
+    return pytest.mark.parametrize(("tracker", "level"), [usual, *more])
 
 
 class Performer:
@@ -90,7 +92,7 @@ def test_a_still_face_with_exact_tracking_needs_nothing(still):
     assert kept(still.tracked()) == (0, 0)
 
 
-@pytest.mark.parametrize(("tracker", "level"), TRACKERS)
+@trackers(("video", 3.0))
 def test_noise_of_the_tracker_is_not_motion(still, tracker, level):
     clip = still.tracked(tracker, level)
     config = GBSConfig(capacity=Capacity("auto"))
@@ -100,7 +102,7 @@ def test_noise_of_the_tracker_is_not_motion(still, tracker, level):
     assert kept(clip) == (0, 0)
 
 
-@pytest.mark.parametrize(("tracker", "level"), TRACKERS)
+@trackers(("per-frame", 1.0))
 def test_motion_is_kept_whatever_the_tracking_error(full, tracker, level):
     performer, (expressions, jaw_bases) = full
     assert expressions > 20
@@ -108,11 +110,6 @@ def test_motion_is_kept_whatever_the_tracking_error(full, tracker, level):
     noisy, noisy_jaw = kept(performer.tracked(tracker, level))
     assert noisy >= expressions
     assert noisy_jaw >= jaw_bases
-
-
-def test_no_frame_but_those_of_training_is_read(still):
-    clip = still.tracked("video", 1.0)
-    assert kept(TrainingView(clip)) == kept(clip)
 
 
 def test_few_timesteps_are_decided_by_poses(full):

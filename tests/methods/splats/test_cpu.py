@@ -5,13 +5,11 @@ Numerical extremes and numbers of threads are in tests/methods/benchmarks/test_e
 
 from __future__ import annotations
 
-import gc
 import os
 import signal
 import threading
 import time
 
-import psutil
 import pytest
 import torch
 from hypothesis import given, settings
@@ -271,20 +269,3 @@ def test_frames_of_other_scenes_in_between_change_nothing():
     assert torch.equal(first.rendering.image, again.rendering.image)
     for name, gradient in first.gradients.items():
         assert torch.equal(gradient, again.gradients[name]), name
-
-
-def test_memory_stays_bounded_over_frames_of_all_sizes():
-    process = psutil.Process()
-
-    def render(count: int) -> None:
-        render_with_gradients(head_shell(count, 200, 180), torch.float32, backend="cpu")
-
-    for count in range(4000, 5000, 250):
-        render(count)
-    gc.collect()
-    before = process.memory_info().rss
-    for count in range(4000, 5000, 24):
-        render(count)
-    gc.collect()
-    # Forty frames of some two megabytes: were they kept, it would be seen.
-    assert process.memory_info().rss - before < 40 << 20

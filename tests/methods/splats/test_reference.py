@@ -192,15 +192,6 @@ def test_moving_splats_and_camera_together_changes_nothing(seed, angle, shift):
     torch.testing.assert_close(one.image[safe], two.image[safe], rtol=0, atol=1e-9)
 
 
-def test_weights_of_two_stacked_splats():
-    """The first has its alpha, the second its own times what the first lets through."""
-    scene = on_axis([2.0, 2.5], [0.1, 0.1], [0.6, 0.5], [[0.0], [0.0]])
-    splats, pixels, weights = pixel_weights(*scene[:4], *scene[5:])
-    middle = pixels == SIZE * (SIZE // 2) + SIZE // 2
-    assert splats[middle].tolist() == [0, 1]
-    torch.testing.assert_close(weights[middle], torch.tensor([0.6, 0.4 * 0.5], dtype=F64), rtol=1e-12, atol=0)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_weights_times_colours_are_the_image(seed):
     """Against a brute-force renderer, with splats behind each other, opaque ones, and ones beyond the border."""

@@ -1,3 +1,3 @@
 """The ball avatars, which have known pictures."""
 
-from ...bench.experiments.conftest import ball_run, balls  # noqa: F401
+from ...bench.experiments.conftest import ball_run, balls, run_of  # noqa: F401

@@ -114,7 +114,7 @@ def test_an_interrupted_training_has_the_processor_of_others(tracked_run):
     assert "Trained on: one kind: subjects a, b, c; unknown processors: subjects d." in text
 
 
-def test_large_images_have_their_own_heading_and_no_primary_endpoints(write_run):
+def test_large_images_have_their_own_heading(write_run):
     for name in ("run", "run-large"):
         folder = write_run(f"suite/{name}/01", {"ga": 30.0, "ours": 31.0})
     first, large = suite_report(folder.parents[1], "ours").split(f"\n# {LARGE}\n")

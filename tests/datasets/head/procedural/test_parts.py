@@ -1,13 +1,12 @@
 """Teeth, gums and tongue lie in the mouth, and the tongue comes out of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.geometry import border_edges, triangle_areas
 from headbench.datasets.head.procedural.anatomy import lip_arc
+from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.head.procedural.parts import (
     ARCH_REACH,
     LOWER_WIDTHS,
@@ -99,6 +98,8 @@ def test_parts_follow_the_identity(head, parts):
         assert np.all(offset.max(axis=0) <= lips.max(axis=0) + 1e-9)
 
 
-def test_a_share_out_of_range_is_refused(head):
+def test_unknown_versions_and_shares_out_of_range_are_refused(head):
     with pytest.raises(InputError, match="tongue_out"):
         render_parts(head, tongue_out=1.5)
+    with pytest.raises(InputError, match="2020"):
+        procedural_head("2021")

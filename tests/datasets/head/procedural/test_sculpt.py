@@ -1,7 +1,5 @@
 """The vocabulary of the sculptor against closed forms, and the stored head against a new sculpture."""
 
-from __future__ import annotations
-
 import numpy as np
 import pymeshlab
 import pytest

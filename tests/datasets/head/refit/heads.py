@@ -1,7 +1,5 @@
 """Heads for refit tests: small ones, and one surface in two topologies; and a performance of any head."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,21 +9,9 @@ from headbench.bench.contracts import FrameKey, HeadPose
 from headbench.datasets.clip import CaptureClip, FrameFiles, without_images
 from headbench.datasets.head.arrays import HeadArrays
 
-from ..toy import toy_head
 
-
-def toy_pair(eyelids: bool = True) -> tuple[HeadArrays, HeadArrays]:
-    """Source and target: equal but for the version's name, so that a refit has an exact solution."""
-    target = toy_head(24, eyelids=eyelids, version="target")
-    return replace(target, version="source"), target
-
-
-def subdivided(head: HeadArrays, seed: int = 0) -> HeadArrays:
-    """The same surface with every triangle cut in four and vertices in random order: another topology.
-
-    New vertices lie in the middle of edges and move as their two ends do, so the surface at rest is the same to
-    the last bit; the joint regressor keeps to the old vertices.
-    """
+def subdivided(head: HeadArrays) -> HeadArrays:
+    """The same surface, every triangle cut in four at the middles of its edges, vertices in random order."""
     edges = np.sort(head.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     unique, index = np.unique(edges, axis=0, return_inverse=True)
     old = len(head.template)
@@ -34,7 +20,7 @@ def subdivided(head: HeadArrays, seed: int = 0) -> HeadArrays:
     ab, bc, ca = middle.T
     quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
     faces = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
-    order = np.random.default_rng(seed).permutation(old + len(unique))
+    order = np.random.default_rng(0).permutation(old + len(unique))
     place = np.argsort(order)  # new index of a vertex
 
     def along(values):
@@ -63,15 +49,9 @@ def subdivided(head: HeadArrays, seed: int = 0) -> HeadArrays:
     )
 
 
-def performance(head: HeadArrays, timesteps: int, *, seed: int = 0, strength: float = 1.0) -> CaptureClip:
-    """A clip without images in which everything moves: smooth curves, the jaw between closed and wide open.
-
-    Parameters
-    ----------
-    strength : float
-        Standard deviation of the expression coefficients.
-    """
-    rng = np.random.default_rng(seed)
+def performance(head: HeadArrays, timesteps: int, *, strength: float = 1.0) -> CaptureClip:
+    """A clip without images in which everything moves; expression coefficients have the deviation ``strength``."""
+    rng = np.random.default_rng(0)
     size = head.expression_basis.shape[2]
     clock = 0.1 * np.arange(timesteps)
 
@@ -85,13 +65,7 @@ def performance(head: HeadArrays, timesteps: int, *, seed: int = 0, strength: fl
     lids = 0.5 * (1 + curves(2))
     poses = {
         t: HeadPose(
-            head_model=head.version,
-            expression=expression[t],
-            rotation=rotation[t],
-            neck=neck[t],
-            jaw=jaw[t],
-            eyes=eyes[t],
-            translation=place[t],
+            *(head.version, expression[t], rotation[t], neck[t], jaw[t], eyes[t], place[t]),
             eyelids=None if head.eyelid_basis is None else lids[t],
             timestep=t,
         )

@@ -1,7 +1,5 @@
 """``headbench prepare refit`` on a capture on disk: what it writes reads back, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -20,7 +18,7 @@ from headbench.datasets.head.refit.rewrite import capture_plan, link_or_copy, wr
 from headbench.datasets.head.refit.settings import RefitCommandSettings
 from headbench.datasets.steps.masks import set_background
 
-from ...tiny_capture import make_plan, write_tiny_capture
+from ...tiny_capture import edit_json, make_plan, write_tiny_capture
 
 
 @pytest.fixture(scope="module")
@@ -90,39 +88,28 @@ def test_a_hole_in_the_grid_is_refused_before_the_fit(finished, tmp_path, monkey
     root, settings, _ = finished
     shutil.copytree(root / "capture", tmp_path / "capture")
     union = next((tmp_path / "capture").glob("UNION*"))
-    path = union / "transforms_train.json"
-    value = json.loads(path.read_text())
-    gone = value["frames"].pop(1)
-    path.write_text(json.dumps(value))
-    lost = {*read_capture(settings.capture).files} - {*read_capture(union).files}
+    edit_json(union / "transforms_train.json", lambda value: value["frames"].pop(1))
+    (lost,) = {*read_capture(settings.capture).files} - {*read_capture(union).files}
     monkeypatch.setattr(block, "solve_frame", lambda *_: pytest.fail("fitted"))
     with pytest.raises(InputError) as caught:
         refit_capture(replace(settings, capture=str(union), out=str(tmp_path / "out")))
-    assert caught.value.file == str(union)
-    assert caught.value.key == f"frame {lost.pop()}"
-    assert f"/{gone['timestep_index']:05d}/{gone['camera_id']}" in caught.value.key
-    assert "no such frame" in caught.value.found
-    assert not lost
+    assert (caught.value.file, caught.value.key) == (str(union), f"frame {lost}")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("other", [None, "another reason"])
 def test_exclusions_of_part_of_a_timestep_are_refused(other, finished):
     """The layout excludes whole timesteps for one reason: one camera's exclusion would become all cameras'."""
-    _, settings, _ = finished
-    clip = read_capture(settings.capture)
+    clip = read_capture(finished[1].capture)
     capture_plan(clip)
-    keys = sorted(clip.excluded)
-    assert len(keys) == len(clip.cameras) > 1
-    excluded, splits = {**clip.excluded, keys[1]: other}, dict(clip.splits)
+    key = sorted(clip.excluded)[1]
+    excluded, splits = {**clip.excluded, key: other}, dict(clip.splits)
     if other is None:
-        del excluded[keys[1]]
-        splits["self_reenactment"] = (*splits["self_reenactment"], keys[1])
-    with pytest.raises(InputError) as caught:
-        capture_plan(replace(clip, excluded=excluded, splits=splits), settings.capture)
+        del excluded[key]
+        splits["self_reenactment"] = (*splits["self_reenactment"], key)
+    with pytest.raises(InputError, match=str(key)) as caught:
+        capture_plan(replace(clip, excluded=excluded, splits=splits))
     assert caught.value.key == "excluded"
-    assert str(keys[0]) in caught.value.found
-    assert f"{keys[1]} {f'excluded: {other}' if other else 'kept'}" in caught.value.found
 
 
 def test_splits_the_layout_cannot_hold_are_refused(finished):
@@ -188,11 +175,7 @@ def test_images_that_a_step_changed_are_written_as_they_are_now(finished, tmp_pa
 def test_files_are_copied_where_they_cannot_be_linked(tmp_path, monkeypatch):
     source, target = tmp_path / "a.png", tmp_path / "b" / "c.png"
     source.write_bytes(b"content")
-
-    def refuse(*_):
-        raise OSError("no links here")
-
-    monkeypatch.setattr(os, "link", refuse)
+    monkeypatch.setattr(os, "link", lambda *_: (source / "a file is no folder").touch())
     link_or_copy(source, target)
     assert target.read_bytes() == b"content"
     assert [*target.parent.iterdir()] == [target]

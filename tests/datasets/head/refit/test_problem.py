@@ -14,12 +14,7 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
 from headbench.datasets.head.model import HeadModel
-from headbench.datasets.head.refit.problem import (
-    FitProblem,
-    angle_bounds,
-    solve_bounded,
-    solve_frame,
-)
+from headbench.datasets.head.refit.problem import FitProblem, angle_bounds, solve_bounded, solve_frame
 from headbench.datasets.head.refit.settings import RefitSettings
 
 from ..toy import toy_head

@@ -110,28 +110,18 @@ def test_people_may_leave_out_what_no_chosen_camera_recorded(capture, tmp_path):
     assert "3" in findings.data["900"]["excluded"]
 
 
-def test_given_threshold_is_used(capture, tmp_path):
-    look(capture, tmp_path, threshold=1e5)
-    decided = read_exclusions(tmp_path / DECISIONS_FILE)["900"]
-    assert (decided.threshold, decided.basis, decided.reasons()) == (1e5, "given", {})
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("threshold", -1.0), ("threshold", np.inf), ("cameras", 0), ("frames", 0)]
-)
-def test_settings_out_of_range_are_refused(capture, tmp_path, name, value):
-    with pytest.raises(InputError) as caught:
-        look(capture, tmp_path, **{name: value})
-    assert caught.value.file == f"--{name}"
+def test_given_threshold_is_used_and_bad_input_is_refused(capture, tmp_path):
+    for name, value in (("threshold", -1.0), ("threshold", np.inf), ("cameras", 0), ("frames", 0)):
+        with pytest.raises(InputError) as caught:
+            look(capture, tmp_path, **{name: value})
+        assert caught.value.file == f"--{name}"
     assert not any(tmp_path.iterdir())
-
-
-def test_no_captures_and_stray_overrides_are_refused(capture, tmp_path):
     with pytest.raises(InputError):
         look(tmp_path, tmp_path / "out")
-    look(capture, tmp_path)
     path = tmp_path / DECISIONS_FILE
-    decided = read_exclusions(path)
-    write_exclusions(path, {"900": replace(decided["900"], overrides={99: "keep"})})
+    look(capture, tmp_path, threshold=1e5)
+    decided = read_exclusions(path)["900"]
+    assert (decided.threshold, decided.basis, decided.reasons()) == (1e5, "given", {})
+    write_exclusions(path, {"900": replace(decided, overrides={99: "keep"})})
     with pytest.raises(InputError, match="99"):
         look(capture, tmp_path)

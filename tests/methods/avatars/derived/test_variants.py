@@ -10,7 +10,7 @@ from headbench.methods.avatars.derived.recipes import EARLY, GA, OURS, Recipe
 from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA as GAMethod
 from headbench.methods.ga.method import GAAvatar
-from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.ours.method import Ours
 from headbench.methods.shared.config import SplatTraining
 
 from ...ours.toy import SMALL, changed, store
@@ -28,7 +28,7 @@ def ga(clip, tmp_path_factory):
 @pytest.fixture(scope="module")
 def ours(clip, tmp_path_factory):
     folder = tmp_path_factory.mktemp("ours")
-    store(clip, folder, changed(SMALL, planes={"resolution": 80}, lines={"resolution": 20}), copies=2)
+    store(clip, folder, changed(SMALL, planes={"resolution": 68}, lines={"resolution": 20}), copies=2)
     return folder
 
 
@@ -56,20 +56,29 @@ def test_recipes_have_names_of_their_own():
     assert Recipe(0.5, 1, storage="coded", cutoffs=EARLY).name == "splats50-sh1-coded-cut2"
 
 
-@pytest.mark.parametrize("kind", ["ga", "ours"])
-def test_every_variant_is_read_back_from_smaller_own_files(kind, request, clip, tmp_path):
-    folder = request.getfixturevalue(kind)
-    derive, read, recipes = {
-        "ga": (ga_variants.variants, GAAvatar.read, GA),
-        "ours": (ours_variants.variants, OursAvatar.read, OURS),
-    }[kind]
-    whole = read(folder, "cpu")
+MADE = ("splats75", "splats50", "splats25", "half", "8bit", "coded", "splats50-coded", "cut2", "cut4")
+"""Variants of both methods that are made and drawn."""
+
+
+@pytest.mark.parametrize(
+    ("derive", "method", "recipes", "more"),
+    [
+        (ga_variants, GAMethod, GA, ("sh0", "splats75-sh1-coded")),
+        (ours_variants, Ours, OURS, ("planes64", "planes32", "lines16", "splats75-planes64-lines16-coded")),
+    ],
+    ids=["ga", "ours"],
+)
+def test_variants_are_read_back_from_smaller_own_files(
+    derive, method, recipes, more, request, clip, tmp_path
+):
+    folder = request.getfixturevalue(method.name)
+    whole = method().load(folder, device="cpu")
     expected = picture(whole, clip)
-    variants = by_name(derive, folder, clip)
+    variants = by_name(derive.variants, folder, clip)
     assert set(variants) == {recipe.name for recipe in recipes}
     quality = {}
-    for name, variant in variants.items():
-        avatar = variant.make(tmp_path / name)
+    for name in (*MADE, *more):
+        avatar = variants[name].make(tmp_path / name)
         files = [*avatar.files(), *avatar.shared_files()]
         assert all(path.parent == tmp_path / name and path.is_file() for path in files)
         changed = name not in ("cut2", "cut4")  # which change no file

@@ -9,6 +9,7 @@ from headbench.methods.avatars.web.export import draw
 from headbench.methods.avatars.web.payload import decode, encode
 
 SIDE = 200
+pytestmark = pytest.mark.commands
 
 
 @pytest.fixture
