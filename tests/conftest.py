@@ -20,6 +20,7 @@ from hypothesis import HealthCheck, settings
 from headbench.bench.io import files
 from headbench.methods.shared.threads import torch_threads
 
+from . import world
 from .axe import serious_findings
 
 # How long an example takes says something of the machine's load, nothing of the code. The examples are the same in every
@@ -111,7 +112,8 @@ ALLOWED_SKIPS = {
 
 
 def pytest_sessionfinish(session):
-    """In CI a skipped test is an error unless its reason is one of `ALLOWED_SKIPS`."""
+    """Remove the shared world. In CI a skipped test is an error unless its reason is one of `ALLOWED_SKIPS`."""
+    world.forget()
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
     if not os.environ.get("CI") or "PYTEST_XDIST_WORKER" in os.environ or reporter is None:
         return

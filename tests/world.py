@@ -44,6 +44,12 @@ def _folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="headbench-tests-")
 
 
+def forget() -> None:
+    """Remove what was built; a worker of a parallel run ends without the interpreter's own clearing."""
+    if _folder.cache_info().currsize:
+        _folder().cleanup()
+
+
 def place(name: str) -> Path:
     """A path for what is built once."""
     return Path(_folder().name, name)

@@ -271,7 +271,7 @@ def test_a_stored_avatar_scores_as_in_its_run(run, cell, images, tmp_path):
     """Its frames and, of what is measured of it as a whole, what the run asks for, under the name of its method."""
     out = str(tmp_path / "out")
     words = ["evaluate", "--avatar", str(cell.folder), "--method", AVATAR["method"], "--out", out, "--trust"]
-    assert cli.main([*words, "--like", str(run), "--data", str(tmp_path / "data")]) == 0
+    assert cli.main([*words, "--like", str(run), "--clip", str(tmp_path / "data")]) == 0
     rows = pd.read_parquet(RunFolder(tmp_path / "out").rows)
     own = pd.read_parquet(RunFolder(run).rows)
     same = [column for column in COLUMNS if column != "version"]

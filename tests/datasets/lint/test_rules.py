@@ -91,7 +91,7 @@ def short_plan(rig):
 SHORT = {"ignore": ("HB110", "HB616")}
 
 
-def test_an_off_centre_principal_point_and_the_other_edge(tmp_path):
+def test_a_point_off_the_centre_and_cy_from_the_other_edge(tmp_path):
     capture = write_good_capture(tmp_path, short_plan(cameras(WIDTH / 2 + 3.0, HEIGHT / 2 - 3.0)))
     assert codes(capture, **SHORT) == ["HB510"]
     replace(Declaration.read(capture.union), cy="top").write(capture.union)
