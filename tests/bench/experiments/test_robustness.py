@@ -39,7 +39,7 @@ def renders(balls, monkeypatch):
 def test_worker_processes_leave_the_same(ball_run):
     folder = ball_run("BURSTING", "LISTED")
     outs = [folder.parent / name for name in ("inline", "tasks")]
-    for out, how in zip(outs, ({}, {"executor": "processes", "workers": 2})):
+    for out, how in zip(outs, ({}, {"executor": "processes", "workers": 1})):
         driven("extremes", folder, out=str(out), **how)
     left = [{p.relative_to(out).as_posix(): p for p in out.rglob("*") if p.is_file()} for out in outs]
     assert left[1].keys() - left[0].keys() == {f"{c}/{n}" for c in CELLS for n in ("outcome.json", "job.log")}
