@@ -49,7 +49,7 @@ from ...shared.surface_points import point_tensors
 from ...shared.surface_splats import SurfaceAvatar
 from ...shared.tensor_files import read_safetensors
 from ..views import importance, training_views
-from .coder import Coder, Source, visibility_classes
+from .coder import Coder, CoderInput, visibility_classes
 from .container import CODEC, Content, write_content
 from .field import field, field_metrics
 from .layouts import COLOURS, Layout, blended, bound, code_subject, grid, networks, offsets, reduced
@@ -65,7 +65,7 @@ class Parts(NamedTuple):
     """An avatar to encode: layout, source, subject and texts; splats in any order."""
 
     layout: Layout
-    source: Source
+    source: CoderInput
     subject: Subject
     text: Mapping[str, str] = {}
 
@@ -121,14 +121,14 @@ class _Splats:
 
     def source(
         self, splats: Mapping[str, Any], others: Mapping[str, Any], metrics: Mapping[str, FloatArray]
-    ) -> Source:
-        """Source of arrays or tensors with a row for each splat, and of others. Harmonics are joined."""
+    ) -> CoderInput:
+        """Arrays or tensors with a row for each splat, and of others. Harmonics are joined."""
         arrays = {name: _numpy(value)[self.rows] for name, value in splats.items()}
         if "sh_dc" in arrays:
             dc, rest = arrays.pop("sh_dc"), arrays.pop("sh_rest")
             arrays[COLOURS] = np.concatenate([dc[:, :, None], rest], axis=2).reshape(len(dc), -1)
         arrays |= {name: _numpy(value) for name, value in others.items()} | {"classes": self._classes}
-        return Source(arrays, self._weights, metrics)
+        return CoderInput(arrays, self._weights, metrics)
 
 
 def _numpy(values: Tensor | np.ndarray) -> np.ndarray:
@@ -199,7 +199,7 @@ def _insta(avatar: InstaAvatar, head: HeadAsset, clip: Clip | None) -> Parts:
     folder = avatar.files()[0].parent  # the files that the avatar was read from
     arrays, text = read_npz(folder / FIELD_FILE), {SETTINGS: json.dumps(read_json(folder / SETTINGS_FILE))}
     arrays["spread"] = np.maximum(arrays["table"].std(dtype=np.float64), 1e-9).reshape(1)
-    return Parts(grid, Source(arrays), read_subject(folder / SUBJECT_FILE, head), text)
+    return Parts(grid, CoderInput(arrays), read_subject(folder / SUBJECT_FILE, head), text)
 
 
 def _rgbavatar(avatar: RGBAvatarAvatar, head: HeadAsset, clip: Clip | None) -> Parts:

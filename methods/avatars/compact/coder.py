@@ -27,7 +27,7 @@ Values = Callable[[], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class CoderInput:
     """What is encoded.
 
     Attributes
@@ -47,7 +47,7 @@ class Source:
 
 
 class Coder:
-    """Encodes arrays of a `Source`, or decodes those of a file.
+    """Encodes arrays of a `CoderInput`, or decodes those of a file.
 
     ``values`` of a call are encoded instead of the array of that name in the source. Decoding raises KeyError for a missing
     array and ValueError for arrays that do not fit each other. ``parts`` has the part of each encoded array: a name of a step of
@@ -55,11 +55,11 @@ class Coder:
     """
 
     def __init__(
-        self, precision: Precision, text: Mapping[str, str], given: Source | Mapping[str, np.ndarray]
+        self, precision: Precision, text: Mapping[str, str], given: CoderInput | Mapping[str, np.ndarray]
     ):
         self.precision, self.text = precision, text
-        self.source = given if isinstance(given, Source) else None
-        self.arrays: dict[str, np.ndarray] = {} if isinstance(given, Source) else dict(given)
+        self.source = given if isinstance(given, CoderInput) else None
+        self.arrays: dict[str, np.ndarray] = {} if isinstance(given, CoderInput) else dict(given)
         self.parts: dict[str, str] = {}
         self._taken: set[str] = set()
 

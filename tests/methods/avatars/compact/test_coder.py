@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from headbench.methods.avatars.compact.coder import Coder, Source, scale_of, visibility_classes
+from headbench.methods.avatars.compact.coder import Coder, CoderInput, scale_of, visibility_classes
 from headbench.methods.avatars.compact.container import pack
 from headbench.methods.avatars.compact.precision import EXACT, Precision
 
 
 def both(values, code, precision=EXACT, **more):
     """What a call gives when it encodes and when it decodes, which must be equal; and the encoder."""
-    encoder = Coder(precision, {}, Source({"x": values}, **more))
+    encoder = Coder(precision, {}, CoderInput({"x": values}, **more))
     found = code(encoder)
     assert not encoder.left
     decoder = Coder(precision, {}, encoder.arrays)
@@ -50,7 +50,7 @@ def test_step_0_is_exact():
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_weights_are_rounded_relative_to_the_largest_of_their_row(seed):
+def test_weights_are_rounded_relative_to_their_row(seed):
     rng = np.random.default_rng(seed)
     values = rng.normal(size=(6, 2, 3, 3)) * 10.0 ** rng.integers(-4, 4, (6, 1, 1, 1))
     values[2] = 0
@@ -97,7 +97,7 @@ def test_units_repeat_along_the_columns():
     assert np.all(error[1::2] > 1)
 
 
-def test_an_error_in_a_class_is_half_as_visible_as_in_the_class_before():
+def test_an_error_is_half_as_visible_in_the_next_class():
     weights = 4.0 ** -np.arange(8)
     classes = visibility_classes(weights, 8)
     assert np.all(np.diff(classes)[:6] == 1)
