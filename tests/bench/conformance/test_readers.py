@@ -146,16 +146,13 @@ def test_a_fingerprint_must_not_depend_on_time_or_place(reader, npz_capture, mon
 
 
 def test_what_is_no_capture_must_be_an_input_error(reader, npz_capture, monkeypatch):
-    monkeypatch.setattr(
-        reader.module, "find", lambda root: [root / "me.npz"] if (root / "me.npz").exists() else [root]
-    )
-    assert check_reader(reader.module.SPEC, npz_capture) == []
     original = reader.module.read
+    find = lambda root: [root / "me.npz"] if (root / "me.npz").exists() else [root]
+    monkeypatch.setattr(reader.module, "find", find)
 
     def read(path, *, dark: bool = False):
-        return (
-            original(path) if path.is_file() and path.suffix == ".npz" else original(npz_capture / "me.npz")
-        )
+        is_capture = path.is_file() and path.suffix == ".npz"
+        return original(path if is_capture else npz_capture / "me.npz")
 
     monkeypatch.setattr(reader.module, "read", read)
     found = check_reader(reader.module.SPEC, npz_capture)

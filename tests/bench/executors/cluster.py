@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 PROGRAMS = ("slurmctld", "slurmd", "munged", "munge", "unmunge", "sbatch", "squeue", "scontrol", "sinfo")
-WAIT_S = 60.0
+WAIT_S = 90.0
 CONFIGURATION = """\
 ClusterName=headbench
 SlurmctldHost=localhost(127.0.0.1)
@@ -118,7 +118,7 @@ def start(folder: Path) -> Path:
     os.environ["SLURM_CONF"] = str(configuration)
     _run("slurmctld", "-i", "-f", str(configuration))
     _run("slurmd", "-N", "localhost", "-f", str(configuration))
-    _wait(lambda: _answer("sinfo", "-h", "-p", "main", "-o", "%t") == "idle", "the node to be idle")
+    wait_for(lambda: _answer("sinfo", "-h", "-p", "main", "-o", "%t") == "idle", "the node to be idle")
     return configuration
 
 
@@ -127,14 +127,14 @@ def stop(folder: Path) -> None:
     os.environ["SLURM_CONF"] = str(folder / "slurm.conf")
     _answer("scancel", "-u", getpass.getuser())
     try:
-        _wait(lambda: _answer("squeue", "-h") == "", "the jobs to end")
+        wait_for(lambda: _answer("squeue", "-h") == "", "the jobs to end")
     finally:
         for name in ("slurmd.pid", "slurmctld.pid", "munge/pid"):
             path = folder / name
             if path.exists():
                 number = int(path.read_text())
                 os.kill(number, signal.SIGTERM)
-                _wait(lambda number=number: not Path(f"/proc/{number}").exists(), f"{name} to end")
+                wait_for(lambda number=number: not Path(f"/proc/{number}").exists(), f"{name} to end")
 
 
 def _free_ports() -> list[int]:
@@ -164,12 +164,12 @@ def _answer(*command: str) -> str:
     return done.stdout.strip()
 
 
-def _wait(condition, what: str) -> None:
+def wait_for(condition, what: str = "what is waited for") -> None:
     end = time.monotonic() + WAIT_S
     while not condition():
         if time.monotonic() > end:
             raise TimeoutError(f"waited {WAIT_S:g} s for {what}")
-        time.sleep(0.2)
+        time.sleep(0.05)
 
 
 if __name__ == "__main__":

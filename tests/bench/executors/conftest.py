@@ -39,12 +39,6 @@ def rows_of():
 
 
 @pytest.fixture
-def inline(config, rows_of):
-    """The rows that every executor is to come to."""
-    return rows_of(replace(config, out=f"{config.out}-inline"))
-
-
-@pytest.fixture
 def command(tmp_path):
     """Start `headbench run` of a configuration in a process of its own, which finds the toy plug-ins."""
     started = []

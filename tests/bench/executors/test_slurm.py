@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from headbench.bench.executors.task import Task
 from headbench.bench.executors.worker import run_job
 from headbench.bench.io.files import write_json
 from headbench.tests.bench.executors import cluster
+from headbench.tests.bench.executors.cluster import wait_for
 
 ABSENT = cluster.missing()
 needs_slurm = pytest.mark.skipif(bool(ABSENT), reason=f"Slurm is not installed: no {', '.join(ABSENT)}")
@@ -50,13 +50,6 @@ def slurm(tmp_path_factory):
     os.environ.pop("SLURM_CONF")
     if before is not None:
         os.environ["SLURM_CONF"] = before
-
-
-def wait_for(condition, seconds=90):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.1)
 
 
 def cell_of(config, subject, method):
@@ -202,30 +195,32 @@ def test_jobs_of_a_killed_process_are_cancelled_first(tmp_path, programs):
     assert read_submitted(tmp_path)["jobs"] == {"a": "3", "b": "7"}
 
 
-ENDED = {
-    "disk full": f"FAILED ExitCode={errno.ENOSPC}:0",
-    "cancelled before it ran": "CANCELLED ExitCode=0:0",
-}
+@pytest.fixture
+def ended(tmp_path, programs):
+    """Job a as the executor sees its end, in some state; submitted by an earlier start or by this one."""
+
+    def ended(state, earlier):
+        programs(scontrol=f"echo JobState={state}", sbatch="echo Submitted batch job 7")
+        if earlier:
+            write_json(submitted_path(tmp_path), {"speed": False, "jobs": {"a": "3"}})
+        executor = module.Slurm(tmp_path, Execution("slurm"), speed=False)
+        executor.submit([Task.of(tmp_path, "a", "builtins:print")])  # whose folder no job has made yet
+        (ended,) = [ended for _ in range(module.POLLS) for ended in executor.poll(0.0)]
+        return ended
+
+    return ended
 
 
-@pytest.mark.parametrize("state", ENDED.values(), ids=[*ENDED])
-def test_jobs_of_an_earlier_start_are_tried_again(tmp_path, programs, state):
-    programs(scontrol=f"echo JobState={state}")
-    write_json(submitted_path(tmp_path), {"speed": False, "jobs": {"a": "3"}})
-    executor = module.Slurm(tmp_path, Execution("slurm"), speed=False)
-    executor.submit([Task.of(tmp_path, "a", "builtins:print")])  # whose folder no job has made yet
-    (ended,) = [ended for _ in range(module.POLLS) for ended in executor.poll(0.0)]
-    assert ended.again
-    assert state.split()[0] in ended.lost
+@pytest.mark.parametrize("state", [f"FAILED ExitCode={errno.ENOSPC}:0", "CANCELLED ExitCode=0:0"])
+def test_jobs_of_an_earlier_start_are_tried_again(ended, state):
+    found = ended(state, earlier=True)
+    assert found.again
+    assert state.split()[0] in found.lost
 
 
-def test_a_job_that_was_cancelled_meanwhile_is_not_tried_again(tmp_path, programs):
-    programs(scontrol="echo JobState=CANCELLED ExitCode=0:0", sbatch="echo Submitted batch job 7")
-    executor = module.Slurm(tmp_path, Execution("slurm"), speed=False)
-    executor.submit([Task.of(tmp_path, "a", "builtins:print")])
-    (ended,) = [ended for _ in range(module.POLLS) for ended in executor.poll(0.0)]
-    assert not ended.again
-    assert ended.lost == "job 7 was cancelled"
+def test_a_job_that_was_cancelled_meanwhile_is_not_tried_again(ended):
+    found = ended("CANCELLED ExitCode=0:0", earlier=False)
+    assert (found.again, found.lost) == (False, "job 7 was cancelled")
 
 
 def test_jobs_that_do_not_end_are_not_submitted_twice(tmp_path, programs, monkeypatch):

@@ -12,21 +12,19 @@ from sklearn.decomposition import PCA
 
 from headbench.bench.contracts import FrameKey, HeadPose
 from headbench.bench.errors import InputError
-from headbench.bench.experiments import robustness
 from headbench.bench.experiments.extremes import (
     ExtremesPlan,
     PoseComponents,
     joint_samples,
     path_poses,
     sampled_poses,
-    typical_pose,
 )
 from headbench.bench.experiments.robustness import RECORD_FILE, extremes_run
 from headbench.bench.experiments.robustness_settings import ExtremesSettings
 from headbench.bench.experiments.specs import AGAINST_TRUTH
 from headbench.bench.experiments.specs import MEASURES as STABILITY
 from headbench.bench.io.images import read_png
-from headbench.bench.io.lock import LOCK_FILE, locked
+from headbench.bench.io.lock import locked
 from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED, SHEET_FILE
 
 VIEWS, SAMPLES, PATH_FRAMES = 4, 2, 2
@@ -89,38 +87,26 @@ def test_a_stable_avatar_passes_and_what_has_no_truth_is_missing(ball_run):
     assert not (folder / "extremes" / "truth").exists()
 
 
-@pytest.mark.parametrize("others", [(), ("BALL",)])
-def test_avatars_that_render_lists_alone_are_missing(ball_run, others):
-    folder = ball_run("LISTED", *others)
+def test_avatars_that_render_lists_alone_are_missing(ball_run):
+    folder = ball_run("LISTED")
     found = extremes_run(settings(folder))
     assert found.passed
     assert "missing: Frames come in lists alone. Ask for a list." in found.text
-    rows = pd.read_parquet(folder / "extremes" / "rows.parquet")
-    missing = rows[rows["method"] == "listed"]
+    missing = pd.read_parquet(folder / "extremes" / "rows.parquet")
     assert set(missing["status"]) == {"missing"}
     assert missing["reason"].str.contains("in lists alone").all()
     assert set(missing["metric"]) == {metric.name for metric in (*STABILITY, *AGAINST_TRUTH)}
-    assert (folder / "extremes" / SHEET_FILE).exists() == bool(others)
-
-
-def test_rows_that_are_there_are_kept(ball_run):
-    folder = ball_run("BALL", "BURSTING")
-    extremes_run(settings(folder, methods=("ball", "bursting")))
-    before = (folder / "extremes" / "rows.parquet").read_bytes()
-    with pytest.raises(InputError, match="hoose another --out"):  # other views: another protocol
-        extremes_run(settings(folder, beyond=10.0))
-    assert (folder / "extremes" / "rows.parquet").read_bytes() == before
-    assert {a["method"] for a in extremes_run(settings(folder, methods=("ball",))).data["avatars"]} == {
-        "ball",
-        "bursting",
-    }
-    assert (folder / "extremes" / "rows.parquet").read_bytes() == before
 
 
 def test_a_burst_where_jaw_and_expression_act_together_is_found(ball_run, balls, tmp_path):
     folder = ball_run("BURSTING", "BALL")
     found = extremes_run(settings(folder))
     assert not found.passed
+    before = (folder / "extremes" / "rows.parquet").read_bytes()
+    with pytest.raises(InputError, match="hoose another --out"):  # other views: another protocol
+        extremes_run(settings(folder, beyond=10.0))
+    extremes_run(settings(folder, methods=("ball",)))  # rows that are there are kept
+    assert (folder / "extremes" / "rows.parquet").read_bytes() == before
     rows = pd.read_parquet(folder / "extremes" / "rows.parquet")
     failed = rows[rows["status"] == "failed"]
     frames = extreme_frames(balls, tmp_path)
@@ -140,36 +126,36 @@ def test_a_burst_where_jaw_and_expression_act_together_is_found(ball_run, balls,
     assert by_method["ball-a", "ball"]["frames_broken"] == 0
 
 
-def test_values_that_are_no_numbers_break_a_limit(ball_run, balls, tmp_path):
-    folder = ball_run("BROKEN")
+def test_splats_that_grow_and_values_that_are_no_numbers_are_found(ball_run, balls, tmp_path):
+    folder = ball_run("SPLATTY", "BROKEN")
     found = extremes_run(settings(folder))
     assert not found.passed
     assert "non_finite is" in found.text
-    written = {path.name for path in (folder / "extremes" / "ball-a" / "broken" / "seed-0").glob("*.png")}
-    assert len(written) == FRAMES - len(extreme_frames(balls, tmp_path))
+    out, extreme = folder / "extremes", len(extreme_frames(balls, tmp_path))
+    rows = pd.read_parquet(out / "rows.parquet").query("status == 'failed' and method == 'splatty'")
+    assert set(rows["metric"]) == {"largest_splat"}
+    assert len(rows) == 2 * extreme
+    # three deviations of 0.2 m, focal length 100 pixels, 1 m away, 30 pixels high
+    assert np.allclose(rows["value"], 3 * 0.2 * 100 / 30, rtol=0.01)
+    assert BROKEN in colours(out / SHEET_FILE)
+    written = {path.name for path in (out / "ball-a" / "broken" / "seed-0").glob("*.png")}
+    assert len(written) == FRAMES - extreme
     assert "typical_turntable-00.png" in written
 
 
-def test_a_splat_that_grows_is_found_in_the_splats_alone(ball_run, balls, tmp_path):
-    folder = ball_run("SPLATTY")
-    rows = extremes_run(settings(folder)) and pd.read_parquet(folder / "extremes" / "rows.parquet")
-    failed = rows[rows["status"] == "failed"]
-    assert set(failed["metric"]) == {"largest_splat"}
-    assert len(failed) == 2 * len(extreme_frames(balls, tmp_path))
-    # three deviations of 0.2 m, focal length 100 pixels, 1 m away, 30 pixels high
-    assert np.allclose(failed["value"], 3 * 0.2 * 100 / 30, rtol=0.01)
-    assert BROKEN in colours(folder / "extremes" / SHEET_FILE)
-
-
-def test_what_is_not_there_is_refused_before_any_work(ball_run, tmp_path):
-    folder = ball_run("BALL", "FLOOR")
-    with pytest.raises(InputError, match=r"run\.json"):
-        extremes_run(settings(tmp_path))
-    with pytest.raises(InputError, match="methods"):
-        extremes_run(settings(folder, methods=("absent",)))
+def test_what_is_not_there_is_refused_before_any_work(ball_run, run_of, tmp_path):
+    folder, floor = ball_run("BALL", "FLOOR"), run_of("ball_plugin:FLOOR", folder=tmp_path / "floor")
     (tmp_path / "moved" / "ball-other").mkdir(parents=True)
-    with pytest.raises(InputError, match="the capture of the run"):
-        extremes_run(settings(folder, data=str(tmp_path / "moved")))
+    for run, changes, match in (
+        (tmp_path / "typo", {}, r"run\.json"),
+        (folder, {"methods": ("absent",)}, "methods"),
+        (floor, {}, "no trivial baseline"),
+        (folder, {"data": str(tmp_path / "moved")}, "the capture of the run"),
+    ):
+        with pytest.raises(InputError, match=match):
+            extremes_run(settings(run, **changes))
+    with locked(folder / "extremes"), pytest.raises(InputError, match="no other process"):
+        extremes_run(settings(folder))
     fit = folder / "ball-a" / "ball" / "seed-0" / "fit.json"
     fit.write_text(fit.read_text().replace('"done"', '"started"'))
     with pytest.raises(InputError, match="training did not end"):
@@ -178,50 +164,9 @@ def test_what_is_not_there_is_refused_before_any_work(ball_run, tmp_path):
     with pytest.raises(InputError, match="a trained avatar"):
         extremes_run(settings(folder))
     assert not (folder / "extremes").exists()
-    with pytest.raises(InputError, match=r"run\.json"):
-        extremes_run(settings(tmp_path / "typo"))
     assert not (tmp_path / "typo").exists()
-
-
-def test_a_run_of_trivial_baselines_has_nothing_to_test(ball_run):
-    folder = ball_run("FLOOR")
-    with pytest.raises(InputError, match="no trivial baseline"):
-        extremes_run(settings(folder))
-
-
-@pytest.mark.parametrize(
-    "changes", [{"views": 0}, {"beyond": 180.0}, {"sigmas": 0.0}, {"samples": 0}, {"path": -1}]
-)
-def test_settings_without_meaning_are_refused(changes):
-    with pytest.raises(ValueError, match=next(iter(changes))):
-        ExtremesSettings("run", **changes)
-
-
-def test_clips_are_adapted_in_its_folder_while_that_is_locked(ball_run, monkeypatch):
-    seen = []
-
-    def trained(run, methods, options, out):
-        seen.append((out, (out / LOCK_FILE).exists()))
-        raise InputError("a", "b", "c", "d")
-
-    monkeypatch.setattr(robustness, "trained", trained)
-    folder = ball_run("BALL")
-    with pytest.raises(InputError):
-        extremes_run(settings(folder))
-    assert seen == [(folder / "extremes", True)]
-    assert not (folder / "extremes").exists()
-
-
-def test_its_folder_is_locked_and_no_link_out_of_the_run(ball_run, tmp_path):
-    folder = ball_run("BALL")
-    with locked(folder / "extremes"), pytest.raises(InputError, match="no other process"):
-        extremes_run(settings(folder))
-    outside = tmp_path / "outside"
-    outside.mkdir()
-    (folder / "extremes").symlink_to(outside)
-    with pytest.raises(InputError, match="a link to"):
-        extremes_run(settings(folder))
-    assert list(outside.iterdir()) == []
+    with pytest.raises(ValueError, match="beyond"):
+        ExtremesSettings("run", beyond=180.0)
 
 
 @pytest.fixture
@@ -241,10 +186,10 @@ def poses_of(values):
     }
 
 
-def clip_of(values, held_out=None):
-    rows = values if held_out is None else np.vstack([values, held_out])
+def clip_of(values):
+    """A clip of a pose for each row, after which a held-out one follows that is far away."""
     keys = tuple(FrameKey("s", "EMO", t, c) for t in range(len(values)) for c in "ab")
-    return SimpleNamespace(subject="s", poses=poses_of(rows), splits={"train": keys})
+    return SimpleNamespace(subject="s", poses=poses_of([*values, 100 + values[0]]), splits={"train": keys})
 
 
 def joined(pose):
@@ -283,7 +228,8 @@ def test_samples_vary_every_component_and_the_jaw_together(values):
     assert np.abs(joint_samples(64, 8, 0.5)).max() == 0.5
     clip = clip_of(values)
     base, *samples = sampled_poses(clip, 8, 16, 3.0)
-    assert np.array_equal(base.expression, typical_pose([*clip.poses.values()]).expression)
+    distances = np.linalg.norm(values[:, :12] - values[:, :12].mean(axis=0), axis=1)
+    assert np.array_equal(base.expression, clip.poses[int(distances.argmin())].expression)
     assert all(pose.timestep is None and pose.expression.dtype == np.float32 for pose in samples)
     assert {pose.rotation.tobytes() for pose in samples} == {base.rotation.tobytes()}
     found = np.array([joined(pose) for pose in samples])
@@ -299,15 +245,3 @@ def test_a_path_is_smooth_and_passes_the_samples(values):
         assert np.allclose(path[frame], joined(pose), atol=1e-5)
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     assert steps[[0, 19, 20, 39]].max() < 0.2 * steps.max()
-
-
-def test_held_out_poses_have_no_say(values):
-    with_others = clip_of(values, held_out=100 * np.ones((9, 15)))
-    pairs = zip(sampled_poses(clip_of(values), 8, 3, 3.0), sampled_poses(with_others, 8, 3, 3.0))
-    assert all(np.array_equal(joined(a), joined(b)) for a, b in pairs)
-
-
-def test_the_typical_pose_is_a_real_one(values):
-    poses = list(clip_of(values).poses.values())
-    distances = np.linalg.norm(values[:, :12] - values[:, :12].mean(axis=0), axis=1)
-    assert typical_pose(poses) is poses[int(distances.argmin())]
