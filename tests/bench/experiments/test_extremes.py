@@ -126,7 +126,7 @@ def test_a_burst_where_jaw_and_expression_act_together_is_found(ball_run, balls,
     assert by_method["ball-a", "ball"]["frames_broken"] == 0
 
 
-def test_splats_that_grow_and_values_that_are_no_numbers_are_found(ball_run, balls, tmp_path):
+def test_splats_that_grow_and_values_not_finite_are_found(ball_run, balls, tmp_path):
     folder = ball_run("SPLATTY", "BROKEN")
     found = extremes_run(settings(folder))
     assert not found.passed
