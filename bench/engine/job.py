@@ -138,7 +138,10 @@ class Job:
         code, earlier = (record.get("code") for record in (self.method.record(), state.get("method", {})))
         if is_outside(self.method.spec.implementation) and "method" in state and code != earlier:
             expected = f"{code}, the digest of the code of {self.method.spec.implementation}"
-            found = f"{earlier}: the code of the plug-in has changed since its training {trained_ago(state)}"
+            changed = (
+                "the code of the plug-in, all Python files of its folder, has changed since its training"
+            )
+            found = f"{earlier}: {changed} {trained_ago(state)}"
             raise InputError(file, "method, code", expected, found, remedy)
         decides = json.loads(json.dumps(self.method.identity(), default=to_jsonable))
         both = ((path, value, _at(state.get("method"), path)) for path, value in _leaves(decides))

@@ -122,7 +122,7 @@ class _Splats:
     def source(
         self, splats: Mapping[str, Any], others: Mapping[str, Any], metrics: Mapping[str, FloatArray]
     ) -> CoderInput:
-        """Input of the coder, of arrays or tensors with a row for each splat, and of others. Harmonics are joined."""
+        """Arrays or tensors with a row for each splat, and of others. Harmonics are joined."""
         arrays = {name: _numpy(value)[self.rows] for name, value in splats.items()}
         if "sh_dc" in arrays:
             dc, rest = arrays.pop("sh_dc"), arrays.pop("sh_rest")

@@ -39,8 +39,7 @@ COARSEST_SHAPE = 2
 before visible ones."""
 FLOOR = 5e-5
 """Splats on a surface smaller than this, metres, are placed as finely as one of this size."""
-DIFFERENCE_STEP = 0.5
-"""Step of differences relative to that of the attribute: in a pose, several differences add up."""
+DIFFERENCE_STEP = 0.5  # of that of the attribute: in a pose, several differences add up
 
 
 def read_coded(

@@ -78,7 +78,7 @@ def test_rows_are_those_of_one_process_and_done_cells_are_kept(config, rows_of, 
 
 
 @pytest.mark.parametrize("subjects", [("subject1",)])
-def test_a_killed_process_is_started_again_up_to_its_restarts(config, rows_of):
+def test_a_killed_process_is_started_again_up_to_its_restarts(config, rows_of, capsys):
     config = replace(config, methods=("dying_plugin:DYING", "dying_plugin:ALWAYS"))
     by_method = dict(iter(rows_of(config, replace(TWO, restarts=1)).groupby("method")))
     kinds = {name: set(own["status"]) for name, own in by_method.items()}
@@ -88,6 +88,8 @@ def test_a_killed_process_is_started_again_up_to_its_restarts(config, rows_of):
     assert read_outcome(cell)["restarts"] == 1
     assert "about to be killed" in (cell / "job.log").read_text()
     assert by_method["always"]["reason"].str.contains("SIGKILL.*2 times").all()
+    assert cli.main(["status", config.out]) == 1
+    assert "0 waiting, 0 running, 1 done, 1 failed" in capsys.readouterr().out
 
 
 def test_a_full_disk_ends_the_run_and_no_cell_is_failed(config):
