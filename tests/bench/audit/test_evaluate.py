@@ -280,6 +280,13 @@ def test_a_stored_avatar_scores_as_in_its_run(run, cell, images, tmp_path):
     assert cli.main(["verify", out, "--trust"]) == 0
 
 
+def test_the_speed_of_a_stored_avatar_is_measured_without_frames(run, cell, tmp_path):
+    given = {"clip": str(tmp_path / "data"), "reader": "toy_plugin:READER", "metrics": ("toy_plugin:CLOCK",)}
+    evaluate_folder(EvaluateSettings(str(cell.folder), out=str(tmp_path / "out"), **given, **AVATAR))
+    (row,) = pd.read_parquet(RunFolder(tmp_path / "out").rows).itertuples()
+    assert (row.method, row.metric, row.status) == ("toy", "clock", "ok")
+
+
 def test_an_avatar_of_another_subject_is_refused(run, cell, toy, tmp_path, monkeypatch):
     stored = tmp_path / "stored"
     shutil.copytree(cell.avatar, stored)
