@@ -34,7 +34,7 @@ _NUMBERS = {
 }
 """Decimal numbers of YAML 1.2. YAML 1.1 takes 074 for 60, 1:30 for 90, and 1e-3 for text."""
 _DAMAGE = (yaml.YAMLError, ValueError, KeyError, IndexError, RecursionError)
-"""What the parser of YAML raises for a value that is none of its tag."""
+"""What the parser of YAML raises for a value that does not fit its tag."""
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -112,7 +112,7 @@ class _Sparse:
 
 
 def _table() -> dict[tuple[str, str], Any]:
-    """What a stream may name. What a stream could alter is made anew, so that it changes nothing for the next file."""
+    """What a stream may name. Classes that a stream could alter are created for each file, so that no file affects the next."""
 
     def array_of(raw: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray:  # protocol 5
         return np.frombuffer(raw, dtype).reshape(shape, order=order)

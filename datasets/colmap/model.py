@@ -68,7 +68,7 @@ class ColmapImage:
     translation: tuple[float, ...]
 
     def check(self, file: Path, key: str) -> None:
-        """Raise `InputError` for a name that leaves the folder of images, or a pose that is none."""
+        """Raise `InputError` for a name that leaves the folder of images, or an invalid pose."""
         for part in self.name.split("/"):
             check_name(part, file, f"{key}, name")
         length = math.hypot(*self.quaternion)
