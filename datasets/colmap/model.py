@@ -38,7 +38,6 @@ def pycolmap() -> Any:
 T = TypeVar("T", "ColmapCamera", "ColmapImage")
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's length; COLMAP normalises quaternions when reading
 _POINT = struct.calcsize("<ddQ")  # x, y and the number of a point of the model
-_IMAGE_WORDS = 10  # number, quaternion, translation, camera, name
 
 
 @dataclass(frozen=True)
@@ -51,11 +50,15 @@ class ColmapCamera:
     params: tuple[float, ...]
 
     def check(self, file: Path, key: str) -> None:
-        """Raise `InputError` for a size or a parameter that no camera has."""
-        if self.width < 1 or self.height < 1:
-            raise InputError(file, key, "an image size in pixels", f"{self.width}x{self.height}")
-        if not np.isfinite(self.params).all():
-            raise InputError(file, key, "finite parameters", str(self.params))
+        """Raise `InputError` for a model that pycolmap does not know, or a size or parameter that no camera has."""
+        count = dict(camera_models().values()).get(self.model)
+        if (
+            count != len(self.params)
+            or min(self.width, self.height) < 1
+            or not np.isfinite(self.params).all()
+        ):
+            expected = "a camera model pycolmap knows, a size in pixels and the model's parameters, finite"
+            raise InputError(file, key, expected, f"{self.model} {self.width}x{self.height} {self.params}")
 
 
 @dataclass(frozen=True)
@@ -94,97 +97,87 @@ class ColmapModel:
 @cache
 def camera_models() -> dict[int, tuple[str, int]]:
     """Name and number of parameters of the camera models pycolmap knows, by COLMAP's number."""
-    models = {}
-    for name, number in pycolmap().CameraModelId.__members__.items():
-        if name != "INVALID":
-            camera = pycolmap().Camera.create_from_model_name(1, name, 1.0, 1, 1)
-            models[int(number)] = (name, len(camera.params))
-    return models
+    names = {int(number): name for name, number in pycolmap().CameraModelId.__members__.items()}
+    create = pycolmap().Camera.create_from_model_name
+    return {
+        k: (name, len(create(1, name, 1.0, 1, 1).params)) for k, name in names.items() if name != "INVALID"
+    }
 
 
 class _Bytes:
-    """Little-endian numbers of a file, in order; raises `InputError` if it ends too early."""
+    """The content of a file in order; raises `InputError` where it ends too early."""
 
     def __init__(self, file: Path) -> None:
-        self.file, self._content, self._place = file, read_bytes(file, "a file of a COLMAP model"), 0
+        self.file, self._left = file, memoryview(read_bytes(file, "a file of a COLMAP model"))
 
-    def take(self, layout: str, key: str) -> tuple[Any, ...]:
-        """Read numbers in a `struct` layout."""
-        with reading(self.file, "a count that the file can hold", key):
-            size = struct.calcsize("<" + layout)
-        start, self._place = self._place, self._place + size
-        if self._place > len(self._content):
-            expected, found = f"{size} more bytes at byte {start}", f"{len(self._content) - start}"
-            raise InputError(self.file, key, expected, found, "The file is truncated or damaged.")
-        return struct.unpack_from("<" + layout, self._content, start)
+    def take(self, size: int, key: str) -> memoryview:
+        """The next bytes."""
+        if size > len(self._left):
+            found, remedy = str(len(self._left)), "The file is truncated or damaged."
+            raise InputError(self.file, key, f"{size} more bytes", found, remedy)
+        part, self._left = self._left[:size], self._left[size:]
+        return part
+
+    def numbers(self, layout: str, key: str) -> tuple[Any, ...]:
+        """The next numbers, of a `struct` layout, little-endian."""
+        return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout), key))
 
     def name(self, key: str) -> str:
-        """Read a text that ends with a zero byte."""
-        end = self._content.find(b"\0", self._place)
-        (text,) = self.take(f"{end + 1 - self._place if end >= 0 else len(self._content) + 1}s", key)
+        """The next text, which ends with a zero byte."""
+        text = bytes(self._left[:4096]).partition(b"\0")[0]
         with reading(self.file, "a name in UTF-8", key):
-            return str(text[:-1], "utf-8")
+            return str(self.take(len(text) + 1, key)[:-1], "utf-8")
 
-    def finish(self) -> None:
-        """Check that the file has no further bytes."""
-        left = len(self._content) - self._place
-        if left:
-            raise InputError(self.file, "", "the end of the file after the last entry", f"{left} more bytes")
+    def entries(self, key: str) -> Iterator[None]:
+        """As many as the file counts; no further bytes may follow the last one."""
+        yield from (None for _ in range(*self.numbers("Q", key)))
+        if self._left:
+            raise InputError(
+                self.file, "", "the end of the file after the last entry", f"{len(self._left)} more bytes"
+            )
 
 
 def _cameras_binary(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    stream, models = _Bytes(file), camera_models()
-    for _ in range(*stream.take("Q", "cameras")):
-        number, model, width, height = stream.take("IiQQ", "camera")
-        key = f"camera {number}"
-        if model not in models:
-            raise InputError(file, key, "a camera model pycolmap knows", f"number {model}")
-        name, length = models[model]
-        yield number, ColmapCamera(name, width, height, stream.take(f"{length}d", key))
-    stream.finish()
+    stream = _Bytes(file)
+    for _ in stream.entries("cameras"):
+        number, model, width, height = stream.numbers("IiQQ", "camera")
+        name, count = camera_models().get(model, (f"number {model}", 0))
+        yield number, ColmapCamera(name, width, height, stream.numbers(f"{count}d", f"camera {number}"))
 
 
 def _images_binary(file: Path) -> Iterator[tuple[int, ColmapImage]]:
     stream = _Bytes(file)
-    for _ in range(*stream.take("Q", "images")):
-        number, *pose, camera = stream.take("I7dI", "image")
-        key = f"image {number}"
-        name = stream.name(key)
-        (points,) = stream.take("Q", key)
-        stream.take(f"{points * _POINT}x", f"{key}, points")
+    for _ in stream.entries("images"):
+        number, *pose, camera = stream.numbers("I7dI", "image")
+        name = stream.name(f"image {number}")
+        stream.take(stream.numbers("Q", f"image {number}")[0] * _POINT, f"image {number}, points")
         yield number, ColmapImage(with_slashes(name), camera, tuple(pose[:4]), tuple(pose[4:]))
-    stream.finish()
 
 
 def _cameras_text(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    lengths = dict(camera_models().values())
     for line, text in _lines(file):
         if words := text.split():
-            if len(words) < 4 or len(words) - 4 != lengths.get(words[1]):
-                expected = "a number, a camera model pycolmap knows, a size and the model's parameters"
-                raise InputError(file, f"line {line}", expected, " ".join(words)[:80])
-            with reading(file, "numbers", f"line {line}"):
-                number, width, height = (int(words[place]) for place in (0, 2, 3))
-                params = tuple(map(float, words[4:]))
-            yield number, ColmapCamera(words[1], width, height, params)
+            with reading(file, "a number, a camera model, a size and parameters", f"line {line}"):
+                number, model, width, height, *params = words
+                camera = ColmapCamera(model, int(width), int(height), tuple(map(float, params)))
+                yield int(number), camera
 
 
 def _images_text(file: Path) -> Iterator[tuple[int, ColmapImage]]:
     lines = _lines(file)
     for line, text in lines:
-        words = text.strip().split(maxsplit=_IMAGE_WORDS - 1)  # the name, which comes last, may have spaces
-        if not words:
+        if not text.strip():
             continue
-        if len(words) != _IMAGE_WORDS:
-            raise InputError(file, f"line {line}", f"{_IMAGE_WORDS} words of an image", f"{len(words)}")
-        with reading(file, "numbers", f"line {line}"):
-            number, camera = int(words[0]), int(words[8])
-            pose = tuple(map(float, words[1:8]))
-        yield number, ColmapImage(with_slashes(words[9]), camera, pose[:4], pose[4:])
+        with reading(file, "ten words of an image, numbers before its name", f"line {line}"):
+            # The name, which comes last, may have spaces.
+            number, *pose, camera, name = text.strip().split(maxsplit=9)
+            a, b, c, d, x, y, z = map(float, pose)
+            yield int(number), ColmapImage(with_slashes(name), int(camera), (a, b, c, d), (x, y, z))
         _, points = next(lines, (0, "missing"))
         if len(points.split()) % 3:
-            expected = "the image's points, three numbers each"
-            raise InputError(file, f"line {line + 1}", expected, "another line")
+            raise InputError(
+                file, f"line {line + 1}", "the image's points, three numbers each", "another line"
+            )
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
@@ -193,12 +186,9 @@ def _lines(file: Path) -> Iterator[tuple[int, str]]:
     return ((number, line) for number, line in lines if not line.startswith("#"))
 
 
-_PLACES = (".", "sparse/0", "sparse")
-
-
 def find_model(path: str | PathLike[str]) -> tuple[Path, Path] | None:
     """Files of cameras and images of the model in a folder or its ``sparse/0`` or ``sparse``; binary files are preferred."""
-    for place in _PLACES:
+    for place in (".", "sparse/0", "sparse"):
         for suffix in (".bin", ".txt"):
             files = Path(path) / place / f"cameras{suffix}", Path(path) / place / f"images{suffix}"
             if all(file.is_file() for file in files):
