@@ -31,8 +31,7 @@ from headbench.datasets.colmap.reader import model_cameras
 from headbench.datasets.drive.table import read_table
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.head.chart import read_chart
-from headbench.datasets.head.loaders import load_head
+from headbench.datasets.head.loaders import load_head, read_chart
 from headbench.datasets.monocular.reader import read_video
 from headbench.datasets.steps.exclude import read_exclusions
 from headbench.methods.shared.checkpoint import load_checkpoint, save_checkpoint

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..machine import processor_count
 from ..progress import progress
-from .outcome import read_outcome
+from .outcome import TaskOutcome, read_outcome, write_outcome
 from .processes import Processes
 from .results import Executor, TaskResult
 from .settings import Execution
@@ -98,6 +98,9 @@ class Schedule:
                 log.warning("%s: %s; it is started again", task.place, lost)
                 return replace(task, restarts=task.restarts + 1)
             reason = f"HeadbenchError: {lost}" + (f", {task.restarts + 1} times" if task.restarts else "")
+            # The process ended before it could record this.
+            known: TaskOutcome = outcome or {"status": "failed", "speed": self.speed}
+            write_outcome(task.folder, {**known, "status": "failed", "speed": self.speed, "reason": reason})
         failures[task.place] = reason
         log.error("%s failed: %s; see %s", task.place, reason, task.folder / TASK_LOG)
         return None

@@ -119,9 +119,7 @@ def cell_states(folder: RunFolder, manifest: Manifest) -> list[CellState]:
         cell = folder.cell(*key)
         place = cell.folder.relative_to(folder.root).as_posix()
         outcome = read_outcome(cell.folder)
-        # A process that ended with its worker leaves an outcome that says running; the rows of an ended run know better.
-        crashed = outcome is not None and outcome["status"] == "running" and key in failed and not works
-        if outcome is not None and not crashed:
+        if outcome is not None:
             found.append(_of_outcome(key, cell.folder, outcome, speed, jobs.get(place, ""), queued))
         elif key in failed:
             found.append(CellState(*key, "failed", failed[key]))

@@ -4,29 +4,190 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...bench.contracts import Progress, no_progress
+from ...bench.contracts import (
+    Avatar,
+    ByteArray,
+    FloatArray,
+    FrameKey,
+    HeadPose,
+    IntArray,
+    Progress,
+    no_progress,
+)
 from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
 from ...bench.engine.stored import open_avatar
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_json
+from ...bench.io.images import quantise, write_png
 from ...bench.io.lock import locked
-from ...bench.io.video import ENCODINGS, browser_encoder
+from ...bench.io.provenance import RENDER
+from ...bench.io.video import ENCODINGS, browser_encoder, write_browser_video
 from ...bench.specs import CommandResult
-from ..head.subject import resting
+from ..clip import CaptureClip
+from ..ga.writer import CANONICAL_JAW, CapturePlan, CaptureWriter, SequencePlan
+from ..head.arrays import JOINT_NAMES, HeadArrays
+from ..head.refit.identity import FACE
+from ..head.subject import PosedSubject, pose_in_head_frame, resting
 from ..video.decode import SUFFIXES
 from .formats import read_signal
-from .measure import DrivenMeasures
-from .output import REST, Renderer, canonical, write_driven_capture, write_driven_video
 from .scene import SEQUENCE, AvatarScene, make_scene
 from .settings import DriveSettings
 from .signal import DrivingSignal, SignalRequest
 from .transfer import Transferred, head_motion, smoothed, transfer, window_length
+
+REST = "REST"
+"""Training sequence of a driven capture, which has to have one: one frame, see `canonical`."""
+
+
+def canonical(head: HeadArrays) -> HeadPose:
+    """The face at rest with an open mouth, as VHAP's canonical parameters have it: unlike the frames of any signal at rest.
+
+    Splits of a capture must not share images.
+    """
+    return replace(resting(head), jaw=np.array(CANONICAL_JAW))
+
+
+class Renderer:
+    """Renders the frames of a clip in the form required by the avatar's method, and records their times.
+
+    Attributes
+    ----------
+    seconds : list[float]
+        Time of each rendered frame.
+    """
+
+    def __init__(self, avatar: Avatar, clip: CaptureClip, adapted: AdaptedClip, progress: Progress):
+        self._avatar, self._clip, self._adapted, self._progress = avatar, clip, adapted, progress
+        self.seconds: list[float] = []
+
+    def frames(self, keys: Sequence[FrameKey]) -> Iterator[ByteArray]:
+        """(H, W, 3) 8-bit images of frames, in order."""
+        background = [float(value) for value in self._clip.background]
+        for number, key in enumerate(keys, 1):
+            seen = self._adapted.key(key)
+            camera, pose = self._adapted.clip.cameras[seen.camera], self._adapted.clip.poses[seen.timestep]
+            start = time.perf_counter()
+            rgb: FloatArray = self._avatar.render(camera, pose, background).rgb
+            self.seconds.append(time.perf_counter() - start)
+            self._progress(number, len(keys), str(key))
+            yield quantise(self._adapted.restore(key, rgb))
+
+
+def write_driven_video(path: Path, renderer: Renderer, clip: CaptureClip, fps: float) -> None:
+    """Write the driven sequence of a clip as a video."""
+    keys = [key for key in clip.splits["self_reenactment"] if key.sequence != REST]
+    write_browser_video(path, renderer.frames(keys), fps, RENDER)
+
+
+def write_driven_capture(out: Path, renderer: Renderer, clip: CaptureClip) -> Path:
+    """Write the frames and poses of a clip in the GaussianAvatars layout; return the folder for readers.
+
+    The driven sequence is held out for self-reenactment; the sequence `REST` is for training.
+    """
+    keys = list(clip.splits["self_reenactment"])
+    sequences: dict[str, list[HeadPose]] = {}
+    places = []
+    for key in keys:
+        poses = sequences.setdefault(key.sequence, [])
+        places.append((key.sequence, len(poses), key.camera))
+        poses.append(clip.poses[key.timestep])
+    red, green, blue = (float(value) for value in clip.background)
+    plan = CapturePlan(
+        subject=clip.subject.replace("_", "-"),
+        head=clip.head,
+        shape=clip.shape,
+        static_offset=clip.static_offset,
+        cameras=[*clip.cameras.values()],
+        sequences=[SequencePlan(name, poses) for name, poses in sequences.items()],
+        test_sequences=[name for name in sequences if name != REST],
+        novel_view_cameras=[],
+        background=(red, green, blue),
+    )
+    writer = CaptureWriter(out, plan)
+    for place, frame in zip(places, renderer.frames(keys)):
+        write_png(writer.image_path(*place), frame, RENDER)
+    return writer.write_metadata()
+
+
+_MILLIMETRES = 1e3
+_MIDDLE = 0.25
+"""Share of the lips' width, on either side of their middle, in which the distance of the lips is measured; corners touch."""
+_JAW = JOINT_NAMES.index("jaw")
+
+
+class DrivenMeasures:
+    """Measures on the vertices of one subject.
+
+    Parameters
+    ----------
+    shape : FloatArray
+        (S,) identity of the avatar.
+    static_offset : FloatArray
+        (V, 3) metres.
+    """
+
+    def __init__(self, head: HeadArrays, shape: FloatArray, static_offset: FloatArray):
+        self._subject = PosedSubject(head, shape, static_offset)
+        everything = np.arange(len(head.template))
+        face = np.asarray(head.regions.get(FACE, everything))
+        self._face = face if len(face) else everything
+        self._lips = _lips(head, self._subject.neutral)
+
+    def jitter_mm(self, poses: Sequence[HeadPose]) -> float | None:
+        """Mean length of the second difference over time of the vertices of the face, millimetres; None for fewer than 3 frames."""
+        if len(poses) < 3:
+            return None
+        total, before = 0.0, []
+        for mesh in self._meshes(poses, self._face):
+            before.append(mesh)
+            if len(before) == 3:
+                total += float(np.linalg.norm(before[2] - 2 * before[1] + before[0], axis=1).mean())
+                before.pop(0)
+        return _MILLIMETRES * total / (len(poses) - 2)
+
+    def spill_mm(self, pose: HeadPose) -> float:
+        """Root mean square distance of the vertices of the face between the neutral head and a pose, head motion apart; millimetres."""
+        (mesh,) = self._meshes([pose_in_head_frame(pose)], self._face)
+        squares = np.square(mesh - self._subject.neutral[self._face]).sum(axis=1)
+        return _MILLIMETRES * float(np.sqrt(squares.mean()))
+
+    def lip_distances_mm(self, poses: Sequence[HeadPose]) -> FloatArray | None:
+        """(T,) smallest distances between the middle of the upper and the lower lip, millimetres; None for heads without lips."""
+        if self._lips is None:
+            return None
+        both, count, found = np.concatenate(self._lips), len(self._lips[0]), []
+        for mesh in self._meshes(poses, both):
+            gaps = mesh[:count, None] - mesh[None, count:]
+            found.append(np.linalg.norm(gaps, axis=2).min())
+        return _MILLIMETRES * np.array(found)
+
+    def _meshes(self, poses: Sequence[HeadPose], vertices: IntArray) -> Iterator[FloatArray]:
+        """(n, 3) vertices of each pose."""
+        for batch in self._subject.batches(poses):
+            yield from batch[:, vertices]
+
+
+def _lips(head: HeadArrays, neutral: FloatArray) -> tuple[IntArray, IntArray] | None:
+    """Vertices of the middle of the upper and of the lower lip, which are those that the jaw moves less or more than half way."""
+    lips = np.asarray(head.regions.get("lips", ()), np.int64)
+    if not len(lips):
+        return None
+    across = neutral[lips, 0]
+    middle, width = (across.min() + across.max()) / 2, np.ptp(across)
+    lips = lips[np.abs(across - middle) < _MIDDLE * width]
+    share = head.skinning_weights[lips, _JAW]
+    share = share / max(float(share.max(initial=0.0)), np.finfo(np.float64).tiny)
+    upper, lower = lips[share < 0.5], lips[share >= 0.5]
+    return (upper, lower) if len(upper) and len(lower) else None
+
 
 RESULT_FILE = "drive.json"
 

@@ -2,18 +2,139 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import numpy as np
+
+from ...bench.contracts import FloatArray
 from ...bench.engine.captures import finds, readers
 from ...bench.errors import InputError
+from ...bench.io.documents import checked, read_yaml
 from ...bench.registry import unknown
-from .blendshapes import is_blendshapes, read_blendshapes
-from .coefficients import is_coefficients, read_coefficients
-from .mapping import read_mapped
-from .signal import DrivingSignal, SignalRequest
+from ..head.arrays import HeadArrays
+from .blendshapes import ARKIT, apply_blendshapes, is_blendshapes, read_blendshapes
+from .names import IDENTITY, NAMES
+from .signal import NO_EYELIDS, POSE_PARTS, DrivingSignal, SignalRequest, make_poses
 from .table import SignalTable, read_table
 from .tracked import is_flame_parameters, read_capture_signal, read_flame_parameters
+
+DEFAULT_HEAD = "flame2020"
+"""Head model of all four."""
+
+
+def is_coefficients(table: SignalTable) -> bool:
+    """Whether a table has expression coefficients under a known name."""
+    return any(name in table.columns for name in NAMES["expression"])
+
+
+def read_coefficients(request: SignalRequest) -> DrivingSignal:
+    """Coefficients of each frame. Identity is ignored."""
+    table = request.columns
+    head = request.head(DEFAULT_HEAD)
+    found = {part: next((n for n in names if n in table.columns), "") for part, names in NAMES.items()}
+    if not found["expression"]:
+        expected = f"expression coefficients: {', '.join(NAMES['expression'])}"
+        raise InputError(table.path, "", expected, ", ".join(sorted(table.columns)))
+    values = {part: table.values(name) for part, name in found.items() if name}
+    parts = _parts(table, values, found)
+    taken = {part: name for part, name in found.items() if name and _drives(part, parts, values)}
+    used = {*taken.values()}
+    unused = {
+        name: "identity" if name in IDENTITY else "no coefficient of the pose"
+        for name in table.columns
+        if name not in used
+    }
+    if "eyelids" in parts and head.eyelid_basis is None:
+        unused[found["eyelids"]] = NO_EYELIDS
+    return DrivingSignal("coefficients", head, make_poses(table.path, head, parts), unused)
+
+
+def _parts(
+    table: SignalTable, values: Mapping[str, FloatArray], names: Mapping[str, str]
+) -> dict[str, FloatArray]:
+    """The parts of poses, those of `NAMES` that hold several or half of one split and joined."""
+    parts = {name: array for name, array in values.items() if name not in ("pose", "left_eye", "right_eye")}
+    if "pose" in values:
+        pose = values["pose"]
+        if pose.shape[1] not in (3, 6):
+            expected = "6 numbers a frame, rotation and jaw, or 3, rotation"
+            raise InputError(table.path, names["pose"], expected, str(pose.shape[1]))
+        parts.setdefault("rotation", pose[:, :3])
+        if pose.shape[1] == 6:
+            parts.setdefault("jaw", pose[:, 3:])
+    sides = [values[side] for side in ("left_eye", "right_eye") if side in values]
+    if len(sides) == 2:
+        parts.setdefault("eyes", np.concatenate(sides, axis=1))
+    return parts
+
+
+def _drives(part: str, parts: Mapping[str, FloatArray], values: Mapping[str, FloatArray]) -> bool:
+    """Whether an array of the signal is in the parts of the poses: ``pose`` and single eyes may be superseded or incomplete."""
+    if part == "pose":
+        return "rotation" not in values or ("jaw" not in values and values[part].shape[1] == 6)
+    if part in ("left_eye", "right_eye"):
+        return "eyes" not in values and "eyes" in parts
+    return True
+
+
+_COMPONENT = re.compile(r"([a-z]+)\.(\d+)")
+
+
+def read_mapped(request: SignalRequest) -> DrivingSignal:
+    """Poses of a table by the map file of the request, ``{column: {coefficient: weight}}``.
+
+    Raises `InputError` for a map with a column that the table lacks, with an unknown coefficient, or with ARKit's names beside
+    coefficients, which are of another head.
+    """
+    table, source = request.columns, Path(request.map)
+    content = {str(name): entry for name, entry in read_yaml(source).items()}
+    weights = checked(content, dict[str, dict[str, float]], source)
+    for column, entry in weights.items() or (("", {}),):
+        if not entry:
+            raise InputError(source, column, "{column: {coefficient: weight}}", "an empty map")
+        if column not in table.columns:
+            raise unknown(str(source), "columns", column, [*table.columns])
+    unused = dict.fromkeys((name for name in table.columns if name not in weights), "not in the map")
+    values = {column: table.single(column) for column in weights}
+    targets = {name for entry in weights.values() for name in entry}
+    blendshapes = targets & {*ARKIT}
+    if blendshapes and blendshapes != targets:
+        other = min(targets - blendshapes)
+        raise InputError(source, other, "names of blendshapes alone, or coefficients alone", "both")
+    sums: dict[str, FloatArray] = {name: np.zeros(len(table)) for name in sorted(targets)}
+    for column, entry in weights.items():
+        for name, weight in entry.items():
+            sums[name] += weight * values[column]
+    if blendshapes:
+        signal = apply_blendshapes(request, sums)
+        return DrivingSignal("mapped", signal.head, signal.poses, {**unused, **signal.unused})
+    head = request.head()
+    return DrivingSignal(
+        "mapped", head, make_poses(table.path, head, _coefficients(source, head, sums)), unused
+    )
+
+
+def _coefficients(source: Path, head: HeadArrays, sums: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """(T, n) parts of poses from (T,) values by the name of a coefficient or of an expression of the head."""
+    length = len(next(iter(sums.values())))
+    lids = {} if head.eyelid_basis is None else {"eyelids": head.eyelid_basis.shape[2]}
+    sizes = {"expression": head.expression_basis.shape[2], **POSE_PARTS, **lids}
+    named = {shape.name: shape.direction for shape in head.named_expressions()}
+    named |= dict(zip(head.expression_names, np.eye(sizes["expression"])))
+    parts = {name: np.zeros((length, size)) for name, size in sizes.items()}
+    for name, values in sums.items():
+        match = _COMPONENT.fullmatch(name)
+        if name in named:
+            parts["expression"] += values[:, None] * named[name]
+        elif match and int(match[2]) < sizes.get(match[1], 0):
+            parts[match[1]][:, int(match[2])] += values
+        else:
+            known = [f"{part}.{n}" for part, size in sizes.items() for n in range(size)]
+            raise unknown(str(source), "coefficients", name, [*named, *known])
+    return parts
 
 
 @dataclass(frozen=True)

@@ -7,22 +7,185 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
+from ..head.arrays import HeadArrays, region
 from ..head.geometry import smoothstep, triangle_areas, unique_pairs, vertex_normals
 from ..head.model import HeadModel, joint_motions
 from ..head.rotations import axis_angle_to_matrix
-from .anatomy import SIDES, Anatomy, Person, measure
-from .correctives import displacement, make_correctives
-from .glasses import make_glasses
+from ..rounding import LENGTH_BITS, on_grid
+from .anatomy import SIDES, Anatomy, Person, linear, measure
+from .fields import smooth_curve, value_noise
 from .hair import STYLES, RootedStrands, Strands, ear_share, make_beard, make_brows_and_lashes, make_hair
 from .history import SkinState
 from .lag import FREE_LENGTH, NECK_SHARE
 from .parts import eye_mesh, tracked_parts
-from .performance import Activations
+from .performance import EXPRESSION_CONTROLS, Activations, Translation
 from .plan import Geometry
 from .skin import gloss_at_rest, make_folds, paint_skin, sagging
-from .volume import smoothed
+from .volume import smoothed, without_joints
+
+_SIDES_OF_TUBE = 8
+_WRAP = 3.0  # 1/m: how the front bends around the face
+_ROOM = 0.002  # metres between skin and frame
+_COLORS = {
+    "metal": ("#8a8a8c", "#b3975f", "#3a3a3c"),
+    "plastic": ("#1c1a19", "#5a3420", "#25324a", "#6b1f24"),
+}
+_RADIUS = {"metal": 0.0009, "plastic": 0.0014}
+
+
+@dataclass(frozen=True, eq=False)
+class GlassesFrame:
+    """(n, 3) vertices at rest, (m, 3) triangles, (n, 3) linear reflectance."""
+
+    vertices: FloatArray
+    faces: IntArray
+    albedo: FloatArray
+
+
+def make_glasses(
+    person: Person, anatomy: Anatomy, points: FloatArray, normals: FloatArray
+) -> GlassesFrame | None:
+    """A frame that sits on the neutral skin (N, 3), or none."""
+    if not person.glasses:
+        return None
+    s, rng = anatomy.scale, np.random.default_rng([person.seed, 17])
+    radius = _RADIUS[person.glasses] * s
+    half = np.array([0.0245, 0.0195]) * s * rng.uniform(0.92, 1.06, 2)
+    roundness = rng.uniform(2.2, 3.6)
+    color = linear(_COLORS[person.glasses][rng.integers(len(_COLORS[person.glasses]))])
+    turn = np.linspace(0.0, 2.0 * np.pi, 56, endpoint=False)
+    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    ring = half * np.sign(ring) * np.abs(ring) ** (2.0 / roundness)
+    level = 0.5 * sum(anatomy.eyes[side].center[1] for side in SIDES) - 0.002 * s
+    lens = 0.0345 * s
+    outlines = {side: ring + np.array([sign * lens, level]) for side, sign in zip(SIDES, (1.0, -1.0))}
+    front = points[normals[:, 2] > 0.2]
+    flat = cKDTree(front[:, :2])
+    depth = max(
+        front[near, 2].max() + _WRAP / s * at[0] ** 2
+        for outline in outlines.values()
+        for at, near in zip(outline, flat.query_ball_point(outline, 0.003 * s))
+        if near
+    ) + (_ROOM * s + radius)
+
+    def placed(at: FloatArray) -> FloatArray:
+        return np.concatenate([at, (depth - _WRAP / s * at[:, :1] ** 2)], axis=1)
+
+    tubes = [_tube(placed(outline), radius, np.array([0.0, 0.0, 1.0]), True) for outline in outlines.values()]
+    inner = lens - half[0]
+    x = np.linspace(-inner, inner, 11)
+    bridge = placed(np.stack([x, level + 0.004 * s + 0.004 * s * (1.0 - (x / inner) ** 2)], axis=1))
+    bridge[:, 2] = np.maximum(bridge[:, 2], anatomy["nose_bridge"][2] + _ROOM * s + radius)
+    tubes.append(_tube(bridge, radius, np.array([0.0, 1.0, 0.0]), False))
+    skin = cKDTree(points)
+    for side, sign in zip(SIDES, (1.0, -1.0)):
+        ear = anatomy[f"{side}_ear"]
+        hinge = placed(np.array([[sign * (lens + 0.96 * half[0]), level + 0.45 * half[1]]]))[0]
+        wide = sign * max(abs(ear[0]) - 0.008 * s, abs(hinge[0]) + 0.004 * s)
+        temple = smooth_curve(
+            np.stack(
+                [
+                    hinge,
+                    np.array([0.35 * hinge[0] + 0.65 * wide, hinge[1], hinge[2] - 0.016 * s]),
+                    np.array([wide, 0.5 * (hinge[1] + ear[1] + 0.026 * s), 0.5 * (hinge[2] + ear[2])]),
+                    np.array([wide, ear[1] + 0.026 * s, ear[2] + 0.006 * s]),
+                    np.array([wide - sign * 0.006 * s, ear[1] + 0.008 * s, ear[2] - 0.014 * s]),
+                ]
+            ),
+            28,
+        )
+        _, near = skin.query(temple)
+        below = _ROOM * s + radius - ((temple - points[near]) * normals[near]).sum(axis=1)
+        temple[1:-4] += (np.maximum(below, 0.0)[:, None] * normals[near])[1:-4]
+        tubes.append(_tube(temple, radius, np.array([0.0, 1.0, 0.0]), False))
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in tubes)])
+    vertices = np.concatenate([vertices for vertices, _ in tubes])
+    faces = np.concatenate([faces + start for (_, faces), start in zip(tubes, first)])
+    return GlassesFrame(vertices, faces, np.tile(color, (len(vertices), 1)))
+
+
+def _tube(path: FloatArray, radius: float, up: FloatArray, closed: bool) -> tuple[FloatArray, IntArray]:
+    """A tube along (k, 3); ``up`` is never along it."""
+    along = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0) if closed else np.gradient(path, axis=0)
+    across = np.cross(along, up)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    upright = np.cross(across, along)
+    upright /= np.linalg.norm(upright, axis=1, keepdims=True)
+    turn = np.linspace(0.0, 2.0 * np.pi, _SIDES_OF_TUBE, endpoint=False)
+    ring = np.cos(turn)[None, :, None] * across[:, None] + np.sin(turn)[None, :, None] * upright[:, None]
+    index = np.arange(len(path) * _SIDES_OF_TUBE).reshape(len(path), _SIDES_OF_TUBE)
+    a, b = (index, np.roll(index, -1, axis=0)) if closed else (index[:-1], index[1:])
+    a1, b1 = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)
+    faces = np.concatenate(
+        [np.stack([a, a1, b1], -1).reshape(-1, 3), np.stack([a, b1, b], -1).reshape(-1, 3)]
+    )
+    return (path[:, None] + radius * ring).reshape(-1, 3), faces
+
+
+DRIVERS: tuple[tuple[str, str], ...] = (
+    *((f"smile_{side}", "jaw_open") for side in SIDES),
+    *((f"cheek_raise_{side}", f"smile_{side}") for side in SIDES),
+    *((f"nose_sneer_{side}", f"upper_lip_up_{side}") for side in SIDES),
+    ("brow_inner_up", "brow_outer_up_left"),
+    ("brow_down_left", "brow_down_right"),
+    ("mouth_frown", "chin_raise"),
+    ("funnel", "jaw_open"),
+    ("pucker", "pucker"),
+    ("cheek_puff", "cheek_puff"),
+)
+"""Two controls whose product drives a corrective; the same one twice is its square."""
+FACE_MM = 0.75
+"""Root mean square displacement of the face by each corrective at level 1, where both of its controls are 1. A choice in the
+range of the errors of trackers."""
+_BROAD = 0.2
+"""Fraction of the largest displacement by its controls at which a corrective has half its strength."""
+_PERIOD = 0.04
+"""Metres between the lattice points of a field, for a head of average size."""
+
+
+def strengths(activations: Activations) -> FloatArray:
+    """(C,) products of the controls that drive the correctives."""
+    return np.array([activations[first] * activations[second] for first, second in DRIVERS])
+
+
+def make_correctives(
+    person: Person, anatomy: Anatomy, head: HeadArrays, neutral: FloatArray, translation: Translation
+) -> FloatArray:
+    """(C, V, 3) displacements, metres, of a subject's neutral vertices (V, 3) at level 1; joints do not move."""
+    skin = np.zeros(len(neutral), bool)
+    skin[anatomy.skin_faces] = True
+    basis = np.asarray(head.expression_basis, np.float64)
+    face = np.intersect1d(region(head, "face"), np.flatnonzero(skin))
+    made = []
+    for number, pair in enumerate(DRIVERS):
+        rows = [EXPRESSION_CONTROLS.index(name) for name in pair if name in EXPRESSION_CONTROLS]
+        moved = np.linalg.norm(basis @ translation.expression[rows].sum(axis=0), axis=1)
+        where = neutral / (_PERIOD * anatomy.scale)
+        noise = [value_noise(where + 31.7 * axis, person.seed + 120 + number) for axis in range(3)]
+        reach = np.where(skin, moved / (moved + _BROAD * moved[skin].max()), 0.0)
+        field = _beyond(basis, reach[:, None] * np.stack(noise, axis=1), skin)
+        amount = on_grid(1e-3 * FACE_MM / np.sqrt((field[face] ** 2).sum(axis=1).mean()), LENGTH_BITS)
+        made.append(without_joints(head, amount * field))
+    return np.stack(made)
+
+
+def _beyond(basis: FloatArray, field: FloatArray, skin: FloatArray) -> FloatArray:
+    """(V, 3) residual of a field on the ``skin`` (V,) after its least-squares fit by a ``basis`` (V, 3, E)."""
+    directions, left = basis[skin].reshape(-1, basis.shape[2]), field.copy()
+    wanted = field[skin].ravel()
+    found, *_ = np.linalg.lstsq(directions, wanted, rcond=None)
+    left[skin] = (wanted - directions @ found).reshape(-1, 3)
+    return left
+
+
+def displacement(correctives: FloatArray, level: float, activations: Activations) -> FloatArray:
+    """(V, 3) displacement by all correctives (C, V, 3), on the grid of lengths."""
+    driven = level * strengths(activations)
+    return on_grid((driven[:, None, None] * correctives).sum(axis=0), LENGTH_BITS)
+
 
 _STRETCH_GLOSS, _LEAST, _MOST = 3.0, 0.6, 1.25  # exponent of the stretch of area, and the range of the latter
 _WET = 1.2  # increase of the lips' gloss by wetness

@@ -69,7 +69,7 @@ GHA = MethodSpec(
     summary="Gaussian Head Avatar: splats driven by networks, drawn as features, sharpened by another network.",
     implementation="headbench.methods.gha.method:GHA",
     config="headbench.methods.gha.config:GHAConfig",
-    variants="headbench.methods.avatars.derived.coded:gha_variants",
+    variants="headbench.methods.avatars.derived.recipes:gha_variants",
     needs="headbench.methods.shared.needs:splats",
     presets={
         **SHORT_PRESETS,

@@ -43,7 +43,7 @@ INSTA = MethodSpec(
     implementation="headbench.methods.insta.method:Insta",
     config="headbench.methods.insta.config:InstaConfig",
     devices=("cpu",),
-    variants="headbench.methods.avatars.derived.coded:insta_variants",
+    variants="headbench.methods.avatars.derived.recipes:insta_variants",
     needs="headbench.methods.shared.needs:insta",
     presets={
         "smoke": {"budget": {"iterations": 40}, **SHORT},

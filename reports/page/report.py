@@ -32,10 +32,8 @@ from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import COMPARISON, layouts, table_of
 from ..tables import AVATAR_TITLE, TITLES, Table
 from ..writers import render_page
-from .cards import cards_of
-from .frames import Pictures, ShownFrame, choose_pictures, frame_values, worst_frames
-from .opening import Opening, opening
-from .record import failed_cells, record_of
+from .frames import Opening, Pictures, ShownFrame, choose_pictures, frame_values, opening, worst_frames
+from .sections import cards_of, failed_cells, loss_curves, record_of
 from .settings import MAX_MB, MAX_SPLIT_MB, PageSettings
 from .split import (
     ENTRY_BYTES,
@@ -47,7 +45,6 @@ from .split import (
     split,
     write_pictures,
 )
-from .training import loss_curves
 from .verdict import verdict
 
 HERE = Path(__file__).parent

@@ -7,8 +7,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.arrays import read_head, save_head
-from headbench.datasets.head.chart import CHART_FILES, read_chart
-from headbench.datasets.head.loaders import load_head
+from headbench.datasets.head.loaders import CHART_FILES, load_head, read_chart
 from headbench.datasets.head.teeth import with_teeth
 
 from .flame_stand_in import write_stand_in

@@ -5,9 +5,14 @@ import pytest
 
 from headbench.datasets.head.arrays import region
 from headbench.datasets.head.geometry import mesh_edges
-from headbench.datasets.synthetic.correctives import DRIVERS, FACE_MM, displacement, make_correctives
 from headbench.datasets.synthetic.performance import CONTROLS
-from headbench.datasets.synthetic.subject import RenderedSubject
+from headbench.datasets.synthetic.subject import (
+    DRIVERS,
+    FACE_MM,
+    RenderedSubject,
+    displacement,
+    make_correctives,
+)
 
 from .conftest import settled
 

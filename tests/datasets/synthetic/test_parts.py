@@ -10,8 +10,7 @@ from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.mesh_pictures import rasterize_mesh
 from headbench.datasets.synthetic.anatomy import front_depth, measure
 from headbench.datasets.synthetic.parts import HIDES, share_that_shows
-from headbench.datasets.synthetic.people import draw_person
-from headbench.datasets.synthetic.plan import load_geometry
+from headbench.datasets.synthetic.plan import draw_person, load_geometry
 
 ICT = Path(__file__).parents[3].parent / "shared/data/ict_facekit/ict_facekit_f16.npz"
 

@@ -12,7 +12,7 @@ from headbench.datasets.head.model import HeadModel
 from headbench.datasets.synthetic.anatomy import linear
 from headbench.datasets.synthetic.hair import STYLES
 from headbench.datasets.synthetic.history import coupled_strengths, over_time
-from headbench.datasets.synthetic.people import draw_person, spread
+from headbench.datasets.synthetic.plan import draw_person, spread
 from headbench.datasets.synthetic.skin import FLUSHES, FOLDS
 from headbench.datasets.synthetic.subject import RenderedSubject
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError, UnavailableError
-from headbench.datasets.video.segmentation import SelfieSegmentation
+from headbench.datasets.video.masks import SelfieSegmentation
 
 
 @pytest.fixture

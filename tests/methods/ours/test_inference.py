@@ -8,9 +8,8 @@ import torch
 
 from headbench.bench.errors import InputError
 from headbench.methods.ops.planes import Bounds, line_offsets
-from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.ours.avatar import LineOffsets, OursAvatar
 from headbench.methods.ours.field import blend_lines, line_table, normalised_weight, offset_layers
-from headbench.methods.ours.inference import LineOffsets
 from headbench.methods.shared.subject_mesh import pose_key
 
 from ..toy_clip import first_view

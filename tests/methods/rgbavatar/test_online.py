@@ -8,8 +8,7 @@ import pytest
 from scipy.stats import chisquare
 
 from headbench.methods.rgbavatar.config import RGBAvatarConfig
-from headbench.methods.rgbavatar.method import RGBAvatarTraining
-from headbench.methods.rgbavatar.online import GLOBAL, LOCAL, OnlineBatches
+from headbench.methods.rgbavatar.method import GLOBAL, LOCAL, OnlineBatches, RGBAvatarTraining
 from headbench.methods.shared.schedule import Timeline
 
 from .small import SMALL

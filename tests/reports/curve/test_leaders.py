@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student_t
 
-from headbench.reports.curve.leaders import Leader, leaders
+from headbench.reports.curve.curve import Leader, leaders
 
 COSTS = np.geomspace(4.0, 64.0, 3)
 

@@ -1,7 +1,6 @@
 """The frame and the methods with which a page opens."""
 
-from headbench.reports.page.frames import Pictures, ShownFrame, frame_values
-from headbench.reports.page.opening import opening
+from headbench.reports.page.frames import Pictures, ShownFrame, frame_values, opening
 from headbench.reports.runs import RunSet
 
 

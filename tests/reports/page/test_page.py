@@ -15,8 +15,8 @@ from headbench.bench.rows import ALL, Rows
 from headbench.reports.page import frames, split
 from headbench.reports.page.frames import ShownFrame, choose_pictures, spread
 from headbench.reports.page.report import write_page, write_report
+from headbench.reports.page.sections import loss_curves
 from headbench.reports.page.settings import PageSettings
-from headbench.reports.page.training import loss_curves
 from headbench.reports.runs import RunData, RunSet
 from headbench.reports.table_report import layouts, table_text
 

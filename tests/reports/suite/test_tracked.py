@@ -8,8 +8,7 @@ import pytest
 
 from headbench.bench.engine.store import RunFolder
 from headbench.reports.runs import RunSet
-from headbench.reports.suite.suite import CROSSED, ENDPOINTS, LARGE, suite_report
-from headbench.reports.suite.tracked import condition_table, drop_table
+from headbench.reports.suite.suite import CROSSED, ENDPOINTS, LARGE, condition_table, drop_table, suite_report
 from headbench.reports.table_report import table_of
 
 PSNR = {

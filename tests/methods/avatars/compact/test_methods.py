@@ -10,7 +10,7 @@ from headbench.methods.avatars.compact import layouts
 from headbench.methods.avatars.compact.codecs import parts_of, write_coded
 from headbench.methods.avatars.compact.container import Content, read_content
 from headbench.methods.avatars.compact.precision import EXACT, Precision
-from headbench.methods.avatars.derived.coded import STEPS, coded_name
+from headbench.methods.avatars.derived.recipes import STEPS, coded_name
 from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.flashavatar.method import FlashAvatar
 from headbench.methods.ga.config import GAConfig

@@ -1,4 +1,4 @@
-"""Provenance of a run's results as text: protocols, captures, versions, settings, failures."""
+"""Cards of methods: description, authors, and results of the runs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ import os
 from dataclasses import asdict
 from typing import Any
 
+from ...bench.engine.stored import training_losses
+from ...bench.errors import InputError
 from ...bench.protocol import TASK_TITLES
+from ...bench.registry import discover
 from ...bench.rows import ALL
+from ...bench.specs import MethodSpec
 from ..runs import RunData, RunSet
 
 
@@ -74,3 +78,68 @@ def failed_cells(runs: RunSet) -> list[tuple[str, str, str, str]]:
         for seed, subject, reason in own[["seed", "subject", "reason"]].itertuples(index=False, name=None):
             found[label, str(seed), str(subject), str(reason)] = None
     return [*found]
+
+
+Curve = list[tuple[int, float]]
+
+
+def loss_curves(runs: RunSet) -> list[dict[str, Any]]:
+    """For each method that recorded positive losses: its index among the methods, and iterations with losses.
+
+    Losses are divided by the first recorded one, and averaged over the subjects that recorded the same iterations as the
+    first; seeds are those of the pictures. Damaged records are ignored.
+    """
+    found = []
+    for index, label in enumerate(runs.methods):
+        run, name = runs.shown[label]
+        curves = []
+        for clip in run.manifest.clips:
+            try:
+                losses = training_losses(run.folder.cell(clip.subject, name, run.seed).avatar)
+            except (InputError, OSError):
+                losses = []
+            if len(losses) > 1 and all(value > 0 for _, value in losses):
+                curves.append([(at, value / losses[0][1]) for at, value in losses])
+        if curves:
+            found.append({"method": index, "points": _mean(curves)})
+    return found
+
+
+def _mean(curves: list[Curve]) -> Curve:
+    iterations = [at for at, _ in curves[0]]
+    alike = [curve for curve in curves if [at for at, _ in curve] == iterations]
+    return [
+        (at, float(f"{sum(curve[i][1] for curve in alike) / len(alike):.4g}"))
+        for i, at in enumerate(iterations)
+    ]
+
+
+def cards_of(runs: RunSet) -> list[dict[str, Any]]:
+    """A card for each method, trivial baselines last.
+
+    Summary, source and citation are those of the registered method of the same name and implementation; other methods
+    have none. ``anchor`` is the name of the card in the page.
+    """
+    specs = {name: plugin.spec for name, plugin in discover("methods").items()}
+    cards = []
+    for index, (label, record) in enumerate(runs.records.items()):
+        spec = specs.get(record.name)
+        known = (
+            spec if isinstance(spec, MethodSpec) and spec.implementation == record.implementation else None
+        )
+        budget = {name: value for name, value in record.budget.items() if value is not None}
+        cards.append(
+            {
+                "anchor": f"method-{index + 1}",
+                "label": label,
+                "name": record.name,
+                "trivial": record.trivial,
+                "summary": known.summary if known else "",
+                "source": known.source if known else "",
+                "bibtex": known.bibtex.strip() if known else "",
+                "version": record.version,
+                "implementation": record.implementation,
+                "budget": "" if record.trivial else ", ".join(f"{n:,} {name}" for name, n in budget.items()),
+            }
+        )
+    return sorted(cards, key=lambda card: card["trivial"])
