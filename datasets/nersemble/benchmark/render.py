@@ -3,19 +3,109 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ....bench.contracts import Progress, no_progress
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ....bench.contracts import Camera, FloatArray, HeadPose, Progress, no_progress
 from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE, open_avatar
 from ....bench.errors import InputError
+from ....bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_arrays
 from ....bench.io.images import quantise, write_png
 from ....bench.specs import CommandResult
 from ...head.arrays import HeadArrays, read_head
 from ...head.loaders import load_head
 from ...head.teeth import with_teeth_where_possible
-from .data import read_sequence
+from ..recording import read_calibration
 from .settings import SubmissionRenderSettings
-from .tracks import MONO
+from .tracks import MEMBERS, MONO, BenchmarkTrack, tracking_file
+
+MOST_SCALE = 1000.0
+EULER_TOLERANCE = 1e-3
+"""Maximum difference between entries of a rotation matrix in the file and from its angles."""
+
+
+@dataclass(frozen=True, eq=False)
+class BenchmarkSequence:
+    """A tracked sequence: cameras by serial, poses by timestep from 0, (S,) shape coefficients."""
+
+    cameras: Mapping[str, Camera]
+    poses: tuple[HeadPose, ...]
+    shape: FloatArray
+
+
+def read_sequence(
+    data: Path, track: BenchmarkTrack, participant: str, sequence: str, head: HeadArrays
+) -> BenchmarkSequence:
+    """Read cameras and tracking of a sequence from the benchmark's folder.
+
+    Parameters
+    ----------
+    head : HeadArrays
+        FLAME 2023 with or without teeth; coefficients are padded with zeros to its bases.
+    """
+    path = tracking_file(data, participant, sequence)
+    arrays = read_arrays(path, MEMBERS)
+    for name, values in arrays.items():
+        check_numbers(path, name, values, MAX_MAGNITUDE)
+    scale = float(arrays["scale"][0, 0])
+    if not 1 / MOST_SCALE <= scale <= MOST_SCALE:
+        raise InputError(path, "scale", f"from {1 / MOST_SCALE:g} to {MOST_SCALE:g}", f"{scale:g}")
+    rotations = Rotation.from_euler("XYZ", arrays["rotation"].astype(np.float64))
+    off = float(np.abs(rotations.as_matrix() - arrays["rotation_matrices"]).max(initial=0.0))
+    if off > EULER_TOLERANCE:
+        expected = "the matrices of the angles in rotation (intrinsic X, Y, Z)"
+        raise InputError(path, "rotation_matrices", expected, f"ones that differ by {off:.3g}")
+    shape = _padded(path, "shape", arrays["shape"], head.shape_basis.shape[2])[0]
+    expression = _padded(path, "expression", arrays["expression"], head.expression_basis.shape[2])
+    neutral = head.template + head.shape_basis @ shape
+    regressor = head.joint_regressor[0]
+    roots = regressor @ neutral + np.einsum("v,vce,te->tc", regressor, head.expression_basis, expression)
+    # scale (R x + t / scale) = scale (R (x - root) + root + t'), the outer scale being the cameras'.
+    translations = arrays["translation"] / scale + rotations.apply(roots) - roots
+    eyelids = None if head.eyelid_basis is None else np.zeros(head.eyelid_basis.shape[2], np.float32)
+    poses = tuple(
+        HeadPose(
+            head.version,
+            expression=expression[row].astype(np.float32),
+            rotation=rotations[row].as_rotvec().astype(np.float32),
+            neck=arrays["neck"][row].astype(np.float32),
+            jaw=arrays["jaw"][row].astype(np.float32),
+            eyes=arrays["eyes"][row].astype(np.float32),
+            translation=translations[row].astype(np.float32),
+            eyelids=eyelids,
+            subject=participant,
+        )
+        for row in range(len(expression))
+    )
+    calibration = read_calibration(data / track.name / participant / "calibration" / "camera_params.json")
+    missing = [serial for serial in track.serials if serial not in calibration.world_to_camera]
+    if missing:
+        raise InputError(
+            calibration.file, "world_2_cam", f"cameras {', '.join(track.serials)}", f"no {missing[0]}"
+        )
+    cameras = {serial: calibration.camera(serial, track.size, track.size) for serial in track.serials}
+    return BenchmarkSequence({s: _nearer(camera, scale) for s, camera in cameras.items()}, poses, shape)
+
+
+def _nearer(camera: Camera, scale: float) -> Camera:
+    """The camera in a world divided by ``scale``."""
+    matrix = camera.world_to_camera.copy()
+    matrix[:3, 3] /= scale
+    return replace(camera, world_to_camera=matrix)
+
+
+def _padded(path: Path, name: str, values: FloatArray, size: int) -> FloatArray:
+    if values.shape[1] > size:
+        remedy = "Give FLAME 2023 with all its bases: flame2023.pkl."
+        raise InputError(
+            path, name, f"at most the {size} coefficients of the head model", f"{values.shape[1]}", remedy
+        )
+    return np.pad(values.astype(np.float64), ((0, 0), (0, size - values.shape[1])))
+
 
 log = logging.getLogger(__name__)
 

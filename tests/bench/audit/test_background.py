@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from headbench.bench import cli
-from headbench.bench.audit.background import check_background
+from headbench.bench.audit.evaluate import check_background
 from headbench.bench.audit.naming import Render
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import write_png

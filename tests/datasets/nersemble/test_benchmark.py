@@ -21,7 +21,7 @@ from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.nersemble.benchmark import tracks
 from headbench.datasets.nersemble.benchmark.command import submission_write
-from headbench.datasets.nersemble.benchmark.data import read_sequence
+from headbench.datasets.nersemble.benchmark.render import read_sequence
 from headbench.datasets.nersemble.benchmark.settings import SubmissionWriteSettings
 from headbench.datasets.nersemble.benchmark.submission import after_encoding, check_submission, decibels
 from headbench.datasets.nersemble.benchmark.tracks import MONO, NVS, tracking_file
