@@ -1,11 +1,8 @@
 """What all adapters have in common: what is checked before any work, given to a program, kept of it, and read back of its renders."""
 
-import json
-import os
 import shutil
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +14,7 @@ from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json
 from headbench.bench.process import ProgramError
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
-from headbench.methods.official import checkout, needs
+from headbench.methods.official import needs
 from headbench.methods.official.flashavatar import method as flashavatar
 from headbench.methods.official.gha.export import GHATracking
 from headbench.methods.official.insta import export as insta
@@ -247,13 +244,6 @@ def test_renders_that_are_not_what_was_listed_are_found(avatar, clip, behave, na
             renders(avatar, clip)
 
 
-@pytest.mark.parametrize("name", ["ga"])
-def test_folders_may_be_relative(method, clip, avatar, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    method.config = replace(method.config, checkout=os.path.relpath(method.config.checkout))
-    assert renders(method.load(Path("avatar"), device="cpu"), clip)
-
-
 # ------------------------------------------------------------------ settings
 
 FAULTS = [
@@ -305,18 +295,6 @@ def test_doctor_names_checkout_and_environment(method, monkeypatch, name):
     assert place.found.endswith(method.config.commit[:12])
     assert environment.found.startswith("instant-ngp 1.0dev" if name == "insta" else "Python 3")
     compile(needs.METHODS[type(method.config)].repository.trial, "trial", "exec")
-
-
-@pytest.mark.parametrize(("name", "remedy"), [("insta", "a CUDA device"), ("gha", "CUDA build of PyTorch")])
-def test_doctor_misses_a_gpu(method, monkeypatch, name, remedy):
-    monkeypatch.setattr(checkout, "_DEVICES", "print('headbench-devices', 0)")
-    monkeypatch.setitem(needs.METHODS, type(method.config), type(method))
-    if name != "insta":
-        probed = {"python": "3", "missing": {}, "failed": "", "torch": "2", "cuda": False}
-        monkeypatch.setattr(checkout, "_answer", lambda *_: (f"headbench-probe {json.dumps(probed)}", ""))
-    (_, environment) = needs.official(method.config, "cpu")
-    assert remedy in environment.remedy
-    assert "cpu-shim" not in environment.remedy, "the shim does not support this code"
 
 
 # ------------------------------------------------------------------ clips
@@ -388,10 +366,3 @@ def test_clips_that_their_code_cannot_take_are_refused(method, clip, case):
     change, expected = case
     with pytest.raises(InputError, match=expected):
         method.check(change(clip), BUDGET)
-
-
-@pytest.mark.parametrize("name", ["gbs"])
-def test_a_mask_that_is_missing_later_is_named(method, clip, tmp_path):
-    last = clip.splits["train"][-1]
-    with pytest.raises(InputError, match=f"{last}.*a mask"):
-        fit(method, replace(clip, masks=clip.masks | {last: None}), tmp_path / "a")

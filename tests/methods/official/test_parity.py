@@ -135,18 +135,6 @@ def test_flashavatar_is_compared_as_tracked_without_a_neck(tmp_path):
     assert {config.settings[name]["samples"] for name in config.methods} == {300}
 
 
-def test_rows_under_a_condition_are_compared():
-    rows = [
-        Row(
-            name, "1", 0, "novel_view", "s", "one", 0, "c", "full", "psnr", value, "hash", condition=condition
-        )
-        for condition, values in (("", (1.0, 2.0)), ("as-tracked", (20.0, 20.5)))
-        for name, value in zip(("native", "official"), values)
-    ]
-    (found,) = differences_of(Rows.of(rows), "native", "official", [0], "as-tracked")
-    assert (found.native, found.official) == ((20.0,), (20.5,))
-
-
 def test_differences_are_paired_by_subject_and_order():
     values = {"ga": (20.0, 22.0, 24.0), "official": (21.0, 22.0, 26.0)}
     rows = [
