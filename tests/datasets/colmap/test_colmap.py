@@ -1,6 +1,8 @@
 """Models written are read back by pycolmap itself; models read are held against it; damage is refused."""
 
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -332,6 +334,18 @@ def test_faults_of_a_dataset_are_named(dataset, damage, message):
     damage(dataset)
     with pytest.raises(InputError, match=message):
         open_clip(dataset)
+
+
+def test_sigterm_keeps_its_handler_with_pycolmap():
+    code = (
+        "import os, signal, sys\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))\n"
+        "from headbench.datasets.colmap.model import pycolmap\n"
+        "pycolmap()\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (7, "")
 
 
 @pytest.mark.parametrize(("start", "end"), [("", "\n"), ("\ufeff", "\r\n")])

@@ -145,14 +145,6 @@ def test_the_convention_is_350_frames_of_at_least_700(frames, held_out):
     assert _last(frames, None)[0] == held_out
 
 
-def test_the_order_of_the_json_means_nothing(written, copied):
-    folder = copied("insta, meshes")
-    edit_json(folder / "transforms.json", lambda document: document["frames"].reverse())
-    one, other = open_clip(folder), open_clip(folder_of(written, "insta, meshes"))
-    assert one.splits["train"] == tuple(key._replace(subject="copied") for key in other.splits["train"])
-    np.testing.assert_array_equal(one.poses[7].rotation, other.poses[7].rotation)
-
-
 def test_each_reader_takes_its_own_folders(written, pristine_capture):
     assert find_reader(folder_of(written, "insta")).name == "monocular"
     assert find_reader(written / "imavatar").name == "monocular"

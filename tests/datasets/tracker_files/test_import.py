@@ -186,12 +186,6 @@ def test_coefficients_fit_the_bases_of_the_head(recordings, copied, tmp_path):
     assert not (tmp_path / "b").exists()
 
 
-def test_a_capture_of_a_reader_needs_no_import(capture, tmp_path):
-    with pytest.raises(InputError, match="a capture that the reader ga reads") as caught:
-        imported(capture.union, tmp_path / "out")
-    assert "headbench lint" in caught.value.remedy
-
-
 class Code:
     """A pickle that would run something."""
 
