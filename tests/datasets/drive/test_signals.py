@@ -13,7 +13,7 @@ from headbench.datasets.drive.signal import SignalRequest
 from headbench.datasets.drive.transfer import transfer
 from headbench.datasets.ga.writer import save_npz
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.head.procedural import model
+from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.head.procedural.surface import load_sculpture
 from headbench.datasets.head.procedural.versions import version_shapes
 from headbench.datasets.head.subject import pose_in_head_frame
@@ -22,7 +22,6 @@ from ..head.refit.heads import subdivided
 from ..head.skinning import skinned
 from ..head.toy import toy_head
 
-procedural_head = functools.cache(model.procedural_head)
 FRAMES = 4
 SOURCE = toy_head(24, eyelids=True, version="flame2020")
 TARGET = replace(SOURCE, version="target")

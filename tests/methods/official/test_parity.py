@@ -76,9 +76,7 @@ def test_both_are_trained_and_their_difference_tabled(folder, capsys, monkeypatc
     ("words", "expected"),
     [
         ("ga --checkout nowhere", "--checkout"),
-        ("ga --checkout repository --python no-such-program --commit=", "--python"),
         ("ga --checkout repository --python ./python --commit= --data nowhere", "nowhere"),
-        ("ga --checkout repository --samples 300", "--samples"),
         ("flashavatar --checkout repository --iterations 15001", "at most 15000 with flashavatar"),
     ],
 )
