@@ -117,7 +117,7 @@ def test_a_moving_head_is_the_mean_of_its_sub_frames(plan, recorded):
         performed={"FREE": turning},
         poses={"FREE": (plan.geometry.translation.pose(zero, "900", 0),)},
     )
-    sharp, blurred = recorded(moving), recorded(moving, motion_blur=2.0)
+    sharp, blurred = recorded(moving), recorded(moving, motion_blur=4.0)
     offsets = blurred.sub_frames("FREE", 0)
     assert len(offsets) > 1
     assert offsets.sum() == pytest.approx(0.0)
