@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -342,6 +343,7 @@ def load_geometry(name: str) -> Geometry:
     return Geometry(head, translation, mouth, "ict-facekit")
 
 
+@functools.cache
 def _procedural(version: str) -> Geometry:
     head = procedural_head(version)
 

@@ -46,14 +46,3 @@ def test_the_linter_says_which_checks_it_skips(plain_folder, capsys):
     assert not {"HB201", "HB301", "HB503", "HB701"} & set(data["skipped"])
     assert not {finding["code"] for finding in data["findings"]} & set(data["skipped"])
     assert data["looked_at"]["frames_decoded"] > 0
-
-
-def test_the_linter_names_no_file_of_another_layout(plain_folder, capsys):
-    main(["lint", str(plain_folder), "--reader", "plain_reader:SPEC", "--json"])
-    findings = {found["code"]: found for found in json.loads(capsys.readouterr().out)["findings"]}
-    assert findings["HB110"]["file"] == plain_folder.name
-
-
-def test_the_linter_refuses_reader_settings_that_it_does_not_use(pristine_capture, capsys):
-    assert main(["lint", str(pristine_capture.union), "--set", "background=1,1,1"]) == 2
-    assert "lint looks at the files" in capsys.readouterr().err

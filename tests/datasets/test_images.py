@@ -60,11 +60,6 @@ def test_bound_holds_after_every_read_and_pixels_are_right(paths, order, capacit
     assert held(store) == min(capacity, len(set(order))) * BYTES
 
 
-def test_shared_pixels_cannot_be_written(paths):
-    with pytest.raises(ValueError, match="read-only"):
-        ImageStore().image(paths[0], WHITE)[0, 0] = 1
-
-
 def test_many_threads_read_right_pixels_within_the_bound(paths):
     store = ImageStore(2 * BYTES / 1e6)
     order = np.random.default_rng(0).integers(0, len(paths), size=400).tolist()
@@ -76,14 +71,6 @@ def test_many_threads_read_right_pixels_within_the_bound(paths):
         results = list(pool.map(read, order))
     assert all(i == value for i, value in results)
     assert held(store) == 2 * BYTES == store._held
-
-
-def test_grey_and_palette_files_become_rgb(tmp_path):
-    grey = np.arange(100, dtype=np.uint8).reshape(10, 10)
-    write_image(tmp_path / "grey.png", grey)
-    np.testing.assert_array_equal(
-        read_image(tmp_path / "grey.png", WHITE), np.repeat(grey[..., None], 3, axis=2)
-    )
 
 
 def test_jpeg_channels_are_in_order(tmp_path):

@@ -6,7 +6,6 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import Delaunay
 
 from headbench.bench.contracts import Camera
-from headbench.bench.errors import InputError
 from headbench.datasets import mesh_pictures
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.mesh_pictures import draw_mesh, portrait_camera, rasterize_mesh
@@ -69,13 +68,6 @@ def test_triangles_drawn_in_parts_give_the_same(monkeypatch):
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_tangle_of_triangles_over_the_whole_picture_is_refused():
-    vertices = np.random.default_rng(0).choice([-30.0, 30.0], size=(300, 3)) * [1, 1, 0.1]
-    faces = np.arange(300).reshape(100, 3)
-    with pytest.raises(InputError, match="times at most"):
-        rasterize_mesh(vertices, faces, camera(1000, 1000))
-
-
 def test_shared_edges_leave_no_hole_and_no_overlap():
     """Every pixel of a finely triangulated square is covered, and by one triangle only."""
     rng = np.random.default_rng(0)
@@ -95,14 +87,6 @@ def test_the_nearer_surface_alone_is_seen_and_none_from_behind():
     assert set(found.face[found.face >= 0].tolist()) == front
     np.testing.assert_allclose(found.depth[found.face >= 0], 4, rtol=1e-6)
     assert (rasterize_mesh(CUBE + [0, 0, 10], CUBE_FACES, view).face == -1).all()
-
-
-def test_vertices_that_are_not_finite_lose_their_triangles_alone():
-    vertices = np.vstack([CUBE, [[np.nan, 0, 0]]])
-    faces = np.vstack([CUBE_FACES, [[0, 1, 8]]])
-    np.testing.assert_array_equal(
-        rasterize_mesh(vertices, faces, camera()).face, rasterize_mesh(CUBE, CUBE_FACES, camera()).face
-    )
 
 
 def test_unshaded_colours_opacity_and_background():
@@ -131,14 +115,6 @@ def test_edges_are_antialiased():
     area = abs(np.cross(np.append(b - a, 0), np.append(c - a, 0))[2])
     assert abs((1 - picture[..., 0]).sum() - area) < 0.01 * area
     assert ((picture > 0.01) & (picture < 0.99)).any()
-
-
-def test_the_outside_is_brighter_than_the_inside():
-    view = camera()
-    outside = draw_mesh(CUBE, CUBE_FACES, view)
-    inside = draw_mesh(CUBE, CUBE_FACES[:, ::-1], view)
-    middle = (view.height // 2, view.width // 2)
-    assert outside[middle].mean() > 1.5 * inside[middle].mean() > 0
 
 
 @pytest.mark.parametrize("yaw", [-0.8, 0.0, 0.8])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from headbench.datasets.novelty import displacement_metric, novelty
+from headbench.datasets.novelty import novelty
 
 
 @pytest.fixture
@@ -42,10 +42,3 @@ def test_shares_of_timesteps_and_of_training_that_never_moves(train):
     still = np.zeros((9, 5))
     assert novelty(still, np.ones((2, 5))) == (1.0, 1.0)
     assert novelty(still, still[:2]) == (0.0, 0.0)
-
-
-def test_distances_are_root_mean_squares_over_vertices():
-    basis = np.random.default_rng(2).normal(size=(40, 3, 6))
-    coefficients = np.random.default_rng(3).normal(size=6)
-    moved = np.sqrt(((basis @ coefficients) ** 2).sum(1).mean())
-    assert np.linalg.norm(coefficients @ displacement_metric(basis)) == pytest.approx(moved)

@@ -72,19 +72,6 @@ def test_mouth_and_eyes_lie_in_the_face_and_the_hair_beside_it():
     assert not (face & hair).any()
 
 
-def test_the_opening_between_the_lips_belongs_to_the_mouth():
-    upper, lower = (HEAD.template[HEAD.regions[f"lip_outside_ring_{side}"]] for side in ("upper", "lower"))
-    middle = 0.5 * (upper[len(upper) // 2] + lower[len(lower) // 2])
-    assert select(labels(), "mouth")[pixel(FRONT, middle)]
-
-
-def test_no_part_leaves_the_silhouette_without_a_mask():
-    covered = silhouette(HEAD.template, HEAD.faces, FRONT)
-    found = labels()
-    assert not ((found != 0) & ~covered).sum() > 5  # centres on an edge may fall either way
-    assert not select(found, "foreground").any()
-
-
 def test_the_foreground_is_the_mask_from_a_half_on():
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[10:, 20:76] = 255

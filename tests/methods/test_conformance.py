@@ -71,20 +71,6 @@ def altered(clip, head):
     )
 
 
-def test_our_methods_are_registered():
-    assert {
-        "flashavatar",
-        "ours",
-        "ga",
-        "gbs",
-        "gha",
-        "insta",
-        "rgbavatar",
-        "mean-image",
-        "nearest-camera",
-    } <= set(SPECS)
-
-
 @pytest.mark.parametrize("name", SPECS)
 def test_keeps_the_contract(name, clip, tmp_path):
     assert check_method(resolved(name), clip, tmp_path) == []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from ...rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
@@ -19,8 +21,9 @@ from .surface import (
 from .versions import SEEDS, basis_of_version, full_version, version_shapes
 
 
+@functools.cache
 def procedural_head(version: str = "2023") -> HeadArrays:
-    """The embedded default head.
+    """The embedded default head, made once in a process.
 
     Parameters
     ----------

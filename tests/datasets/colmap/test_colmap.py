@@ -10,9 +10,6 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from headbench.bench.conformance.readers import check_clip
 from headbench.bench.contracts import no_progress
@@ -23,7 +20,6 @@ from headbench.datasets.colmap.reader import model_cameras, model_lenses
 from headbench.datasets.colmap.writer import export_model, export_tracking, image_name
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.subject import PosedSubject
-from headbench.datasets.images import write_image
 from headbench.datasets.open import open_clip
 
 from ..tiny_capture import projected
@@ -132,29 +128,6 @@ def test_reader_equals_pycolmap_on_models_with_points(tmp_path, suffix):
         np.testing.assert_allclose(found.world_to_camera[:3], image.cam_from_world().matrix(), atol=1e-12)
         np.testing.assert_allclose(found.K, model.cameras[7].calibration_matrix(), rtol=1e-14)
         assert np.isclose(np.linalg.det(found.world_to_camera[:3, :3]), 1)
-
-
-@settings(deadline=None, max_examples=30)
-@given(
-    turn=st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3),
-    shift=st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3),
-    focal=st.floats(1, 1e5),
-    centre=st.floats(-1e4, 1e4),
-)
-def test_any_pose_survives(tmp_path_factory, turn, shift, focal, centre):
-    matrix = np.column_stack([Rotation.from_rotvec(turn).as_matrix(), shift])
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=1, model="PINHOLE", width=9, height=9, params=[focal, 1.0, centre, -centre])
-    )
-    model.add_image_with_trivial_frame(
-        pycolmap.Image("a.png", np.zeros((0, 2)), 1, 1), pycolmap.Rigid3d(matrix)
-    )
-    folder = tmp_path_factory.mktemp("model")
-    model.write_binary(folder)
-    camera = model_cameras(read_model(folder))["a.png"]
-    np.testing.assert_allclose(camera.world_to_camera[:3], matrix, rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(camera.K, [[focal, 0, centre], [0, 1, -centre], [0, 0, 1]])
 
 
 @pytest.mark.parametrize(
@@ -335,17 +308,6 @@ def test_images_named_as_vhap_does_are_read(clip, dataset):
     assert {(key.timestep, key.camera) for key in found.files} == {
         (key.timestep, key.camera) for key in clip.files
     }
-
-
-def test_an_alpha_channel_serves_as_the_mask(clip, dataset):
-    for key in clip.files:
-        path = dataset / "images" / image_name(key)
-        write_image(path, np.dstack([clip.image(key), clip.mask(key)]))
-    shutil.rmtree(dataset / "masks")
-    found = open_clip(dataset)
-    for key in clip.files:
-        np.testing.assert_array_equal(found.mask(key), clip.mask(key))
-        np.testing.assert_array_equal(found.image(key), clip.image(key))
 
 
 def turn_one_camera(dataset):

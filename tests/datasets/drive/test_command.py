@@ -141,13 +141,6 @@ def test_the_head_rests_where_the_capture_shows_it(place, capsys, pristine_captu
     np.testing.assert_allclose(camera.world_to_camera, plan.cameras[0].world_to_camera, atol=1e-9)
 
 
-def test_an_identity_of_its_own_is_kept(place, capsys):
-    shape = np.full(6, 1.5)
-    write_mesh_avatar(place / "other", HEAD, shape=shape)
-    assert drive(capsys, avatar="other")[0] == 0
-    np.testing.assert_allclose(read_capture("out").shape, shape)
-
-
 def csv(text):
     Path("signal.csv").write_text(text)
     return "signal.csv"

@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.bench.errors import InputError
 from headbench.datasets.drive.blendshapes import ARKIT, JAW_OPEN
 from headbench.datasets.drive.formats import read_signal
 from headbench.datasets.drive.signal import SignalRequest
 from headbench.datasets.drive.transfer import transfer
-from headbench.datasets.ga.writer import pose_to_parameters, save_npz
+from headbench.datasets.ga.writer import save_npz
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.head.procedural import model
+from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.head.procedural.surface import load_sculpture
 from headbench.datasets.head.procedural.versions import version_shapes
 from headbench.datasets.head.subject import pose_in_head_frame
@@ -23,7 +22,6 @@ from ..head.refit.heads import subdivided
 from ..head.skinning import skinned
 from ..head.toy import toy_head
 
-procedural_head = functools.cache(model.procedural_head)
 FRAMES = 4
 SOURCE = toy_head(24, eyelids=True, version="flame2020")
 TARGET = replace(SOURCE, version="target")
@@ -258,45 +256,3 @@ def test_a_map_takes_columns_to_coefficients(tmp_path):
     for frame, (grin, mouth) in enumerate([(0.5, 0.25), (-1, 0.5)]):
         wanted = skinned(SOURCE, [-grin, 0, 2 * grin], jaw=[0.4 * mouth, 0, 0])
         assert gaps_mm(found[frame], wanted).max() < 1e-6
-
-
-def test_a_map_takes_columns_to_blendshapes(tmp_path):
-    (tmp_path / "a.csv").write_text("happy\n0.5\n")
-    (tmp_path / "map.yaml").write_text("happy: {mouthSmileLeft: 1.0, mouthSmileRight: 0.5}\n")
-    head = procedural_head("2023")
-    _, found = driven(tmp_path / "a.csv", head, map=str(tmp_path / "map.yaml"))
-    wanted = head.template + 0.5 * sculpture()["smile_left"] + 0.25 * sculpture()["smile_right"]
-    assert gaps_mm(found[0], wanted, head).max() < 0.01
-
-
-def test_parameters_of_headbenchs_own_writer_are_read(tmp_path):
-    pose = read_signal(SignalRequest(deca(tmp_path / "x")[0], SOURCE)).poses[2]
-    save_npz(tmp_path / "p" / "00000.npz", pose_to_parameters(pose) | {"shape": np.zeros(6)})
-    again = read_signal(SignalRequest(tmp_path / "p", SOURCE, signal_head="avatar"))
-    np.testing.assert_allclose(again.poses[0].expression, pose.expression, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("options", "key"),
-    [({}, "--sequence"), ({"sequence": "FREE", "signal_head": "typo.pkl"}, "--signal-head")],
-)
-def test_captures_need_a_sequence_and_the_head_that_is_named(pristine_capture, options, key):
-    with pytest.raises(InputError, match=key):
-        driven(pristine_capture.union, **options)
-
-
-def test_eyes_and_poses_that_drive_nothing_are_listed(tmp_path):
-    frame = {"exp": [0.0] * 6, "rotation": [0.0] * 3, "jaw": [0.0] * 3, "pose": [0.1] * 6}
-    frame["eye_l_pose"] = [0.1] * 3
-    (tmp_path / "a.json").write_text(json.dumps({"frames": [frame]}))
-    signal, _ = driven(tmp_path / "a.json", signal_head="avatar")
-    assert {"pose", "eye_l_pose"} <= signal.unused.keys()
-
-
-def test_lists_of_categories_are_read_in_frames_too(tmp_path):
-    categories = [[{"categoryName": "jawOpen", "score": 0.5}]]
-    (tmp_path / "a.json").write_text(json.dumps({"frames": [{"faceBlendshapes": categories}]}))
-    (tmp_path / "b.jsonl").write_text(json.dumps({"jawOpen": 0.5}))
-    first, second = (driven(tmp_path / name)[0].poses[0].jaw for name in ("a.json", "b.jsonl"))
-    np.testing.assert_array_equal(first, second)
-    assert first[0] > 0

@@ -87,18 +87,6 @@ def test_faulty_parameters_are_refused(tmp_path, name):
         read_tracking(write_files(tmp_path, **REFUSED[name]), HEAD, "s")
 
 
-def test_rows_may_lack_the_batch_axis(tmp_path):
-    files = write_files(tmp_path, jaw_pose=lambda t: np.ones(3))
-    assert read_tracking(files, HEAD, "s").poses[0].jaw.shape == (3,)
-
-
-def test_numbers_that_overflow_float32_are_refused(tmp_path):
-    files = write_files(tmp_path)
-    np.savez(files[1], **{**np.load(files[1]), "expr": np.full((1, 5), 1e39)})
-    with pytest.raises(InputError, match=r"00001.npz, expr: expected numbers from"):
-        read_tracking(files, HEAD, "s")
-
-
 def test_teeth_policies():
     file, toothed = Path("x"), with_teeth(HEAD)
     more = len(toothed.template)

@@ -71,13 +71,6 @@ def test_exact_mesh_alone_agrees_wholly():
     assert evidence.bottom < 0.5 * evidence.top
 
 
-def test_empty_and_full_masks_do_not_decide():
-    views = make_views(5.0, 0.0)
-    for mask in (np.zeros((HEIGHT, WIDTH), np.uint8), np.full((HEIGHT, WIDTH), 255, np.uint8)):
-        blind = [OutlineView(v.vertices, v.camera, lambda mask=mask: mask) for v in views]
-        assert weigh_cy(blind, HEAD.faces).decision is None
-
-
 def test_image_border_is_no_outline():
     """A mesh that fills the lower half of the image, cut by three borders, agrees along one line only."""
     camera = Camera("c", 40, 40, np.array([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), np.eye(4))

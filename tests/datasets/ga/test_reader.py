@@ -107,11 +107,6 @@ def test_one_camera_has_no_novel_view(tmp_path):
     assert [len(clip.splits[name]) for name in ("train", "novel_view", "self_reenactment")] == [4, 0, 2]
 
 
-def test_captures_of_one_head_model_share_it_in_memory(pristine_capture):
-    first, second = read_capture(pristine_capture.union), read_capture(pristine_capture.union)
-    assert first.head is second.head
-
-
 def test_captures_are_found_from_the_folder_above(pristine_capture, tmp_path):
     root = pristine_capture.writer.root
     assert find_captures(root) == [pristine_capture.union]
@@ -225,12 +220,6 @@ def test_undecidable_cy_asks_for_a_declaration(capture):
     np.testing.assert_array_equal(
         read_capture(capture.union, cy="centre").cameras[FRONTAL].K[:2, 2], [24, 32]
     )
-
-
-def test_cy_near_the_centre_needs_no_decision(tmp_path):
-    capture = write_tiny_capture(tmp_path, make_plan(cameras=rig(cy=32.4)))
-    (capture.union / "headbench.json").unlink()
-    assert "immaterial" in read_capture(capture.union).steps[0].parameters["cy_from"]["source"]
 
 
 def test_splits_can_be_made_anew(capture):

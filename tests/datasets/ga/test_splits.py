@@ -51,11 +51,6 @@ def test_every_frame_is_in_one_split_and_held_out_where_asked(cameras, sequences
     )
 
 
-def test_full_name_wins_over_prefix():
-    keys = [FrameKey("s", name, t, "a") for t, name in enumerate(["FREE", "FREE-2"])]
-    assert split_by_holding_out("x", keys, ["FREE"], [])["self_reenactment"] == (keys[0],)
-
-
 def test_ambiguous_prefixes_and_repeated_keys_are_refused():
     with pytest.raises(InputError, match=r"EMO-1-shout\+laugh, EMO-2"):
         split_by_holding_out("x", KEYS, ["EMO"], [])

@@ -100,14 +100,6 @@ def test_size_and_intrinsics_may_stand_at_the_top_level(tmp_path):
     assert read_transforms(path)[0].intrinsics["cx"] == 21.0
 
 
-@pytest.mark.parametrize("suffix", [".PNG", ".jpg", ".Jpeg", ""])
-def test_suffixes_of_images_are_read_in_any_case(capture, suffix):
-    entry = read_transforms(capture.union / "transforms_train.json")[0]
-    capture.each_frame(lambda frame: frame.update(file_path=frame["file_path"].removesuffix(".png") + suffix))
-    found = read_transforms(capture.union / "transforms_train.json")[0].image
-    assert found == entry.image.with_suffix(suffix or ".png")
-
-
 def test_paths_with_backslashes_and_a_byte_order_mark_are_read(capture):
     path = capture.union / "transforms_train.json"
     expected = [(entry.image, entry.mask, entry.parameters) for entry in read_transforms(path)]

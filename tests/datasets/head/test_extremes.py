@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from headbench.bench.contracts import no_progress
-from headbench.datasets.head.extremes import HEAD_EXTREMES, stress, try_extreme
+from headbench.datasets.head.extremes import HEAD_EXTREMES, try_extreme
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.rotations import axis_angle_to_matrix
 
@@ -16,13 +15,6 @@ HEAD = toy_head(16, eyelids=True)
 @pytest.mark.parametrize("case", HEAD_EXTREMES, ids=lambda case: case.name)
 def test_extreme_of_the_head_model(case):
     assert try_extreme(case, HEAD)["verdict"] == "ok"
-
-
-@pytest.mark.slow
-def test_the_whole_head_command_passes():
-    found = stress(False, no_progress)
-    assert found.passed
-    assert len(found.data["verdicts"]) == len(HEAD_EXTREMES)
 
 
 def test_rounding_that_is_too_coarse_is_found(monkeypatch):

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from headbench.datasets.head.geometry import (
     border_edges,
     even_weights,
-    fit_sphere,
     rigid_alignment,
     smoothstep,
     triangle_areas,
@@ -49,13 +48,6 @@ def test_a_mirror_image_is_met_by_a_rotation():
 def test_smoothstep():
     np.testing.assert_allclose(smoothstep(np.array([-1.0, 0, 0.25, 1, 2]), 0, 1), [0, 0, 0.15625, 1, 1])
     assert smoothstep(np.array([0.2]), 1.0, 0.0) == pytest.approx(1 - smoothstep(np.array([0.2]), 0.0, 1.0))
-
-
-def test_sphere():
-    directions = points(100) / np.linalg.norm(points(100), axis=1, keepdims=True)
-    center, radius = fit_sphere([0.3, -0.2, 0.9] + 0.012 * directions[directions[:, 2] < 0.3])
-    np.testing.assert_allclose(center, [0.3, -0.2, 0.9], atol=1e-10)
-    assert radius == pytest.approx(0.012, abs=1e-10)
 
 
 @pytest.mark.parametrize("count", [0, 1, 500])

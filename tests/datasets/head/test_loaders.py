@@ -53,14 +53,6 @@ def test_version_is_not_guessed(name):
         flame_version(Path("some/where") / name)
 
 
-def test_files_beside_what_a_link_leads_to_are_found(tmp_path):
-    path = write_stand_in(tmp_path / "real")
-    (tmp_path / "linked").mkdir()
-    link = tmp_path / "linked" / path.name
-    link.symlink_to(path)
-    assert load_head(link).fingerprint() == load_head(path).fingerprint()
-
-
 def test_version_is_asked_for_where_the_name_is_silent(tmp_path):
     path = write_flame(tmp_path / "model.pkl", FLAME)
     with pytest.raises(InputError, match="not interchangeable") as caught:
@@ -106,12 +98,6 @@ def test_eyelids_of_another_folder_may_be_named(tmp_path):
         load_head(path, eyelids=tmp_path)
 
 
-def test_what_is_not_there_is_left_out(tmp_path):
-    head = load_head(write_stand_in(tmp_path / "a" / "b", with_masks=False, with_eyelids=False))
-    assert head.regions == {}
-    assert head.eyelid_basis is None
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -126,19 +112,6 @@ def test_eyelids_are_checked(tmp_path, change):
     change(path.parent / "r_eyelid.npy")
     with pytest.raises(InputError, match="eyelid"):
         load_head(path)
-
-
-def test_arrays_of_a_pickle_may_be_written_to(tmp_path):
-    """PyTorch warns of others, on every good capture."""
-    head = load_head(write_stand_in(tmp_path))
-    assert all(np.asarray(getattr(head, name)).flags.writeable for name in STORED)
-
-
-@pytest.mark.parametrize("name", ["generic_neutral_mesh.obj", "flame2023.ply", "head.pkl"])
-def test_a_mesh_is_no_head_model(tmp_path, name):
-    (tmp_path / name).write_text("# a head\nv 0 0 0\n")
-    with pytest.raises(InputError, match="a head model with its bases"):
-        load_head(tmp_path / name)
 
 
 def test_our_npz_round_trip(tmp_path):

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from headbench.bench.errors import InputError
-from headbench.datasets.head import teeth
 from headbench.datasets.head.arrays import RING_REGIONS
 from headbench.datasets.head.model import HeadModel
 from headbench.datasets.head.teeth import lip_rings, with_teeth
@@ -148,20 +147,6 @@ def test_rings_are_those_of_gaussianavatars_rule():
         np.testing.assert_array_equal(found, expected)
     toothed = with_teeth(real_head()).validate("toothed")
     assert len(toothed.template) - len(stand_in().template) == 120
-
-
-@pytest.mark.parametrize("length", [5, 9, 13, 99])
-def test_fewer_vertices_of_a_ring_are_taken_evenly(length, monkeypatch):
-    monkeypatch.setattr(teeth, "RING_LENGTH", length)
-    head = real_head()
-    count = min(length, 15)
-    for found, ring in zip(lip_rings(head), rings()):
-        assert len(found) == count
-        assert set(found) <= set(ring)
-        x = head.template[found, 0]
-        assert (np.diff(x) < 0).all()  # from the left to the right, as published
-        spacing = np.ptp(x) / (count - 1)
-        assert np.abs(x - np.linspace(x[0], x[-1], count)).max() < 1.5 * spacing
 
 
 @pytest.mark.parametrize("where", ["outer lips alone in the face", "wall in the face", "no face"])

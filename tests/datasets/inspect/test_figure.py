@@ -6,19 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from headbench.bench.contracts import FrameKey
-from headbench.datasets.figures import DPI, HELD_OUT, TRAIN, hexadecimal, new_figure, pixels
+from headbench.datasets.figures import HELD_OUT, TRAIN, hexadecimal, new_figure, pixels
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.inspect.figure import (
-    WIDTH,
-    draw_figure,
     draw_rig,
     head_frame,
     overlay,
     pick_cameras,
     pick_timesteps,
 )
-from headbench.datasets.inspect.statistics import expression_space, sequence_rows, split_rows
+from headbench.datasets.inspect.statistics import expression_space
 
 from ..lint.good_capture import FRONTAL
 from ..tiny_capture import look_at
@@ -105,17 +102,3 @@ def test_timesteps_are_distinct_and_told_why(clip):
     reasons = {reason: timestep for timestep, reason in pick_timesteps(clip, space, 3)}
     assert reasons["widest jaw"] == max(clip.poses, key=lambda t: np.linalg.norm(clip.poses[t].jaw))
     assert reasons["calmest face"] == min(clip.poses, key=lambda t: np.linalg.norm(clip.poses[t].expression))
-
-
-def test_a_clip_with_holes_and_without_tests_is_drawn(clip):
-    """One camera did not record a timestep; nothing is held out."""
-    gone = FrameKey(clip.subject, "FREE", 14, "222200042")
-    kept = {key: files for key, files in clip.files.items() if key.sequence == "FREE" and key != gone}
-    poses = {key.timestep: clip.poses[key.timestep] for key in kept}
-    splits = {"train": tuple(kept), "novel_view": (), "self_reenactment": ()}
-    bare = replace(clip, files=kept, poses=poses, splits=splits)
-    picture = draw_figure(
-        bare, split_rows(bare), sequence_rows(bare), expression_space(bare), timesteps=10, cameras=2
-    )
-    assert picture.shape[1] == WIDTH * DPI
-    assert len(np.argwhere((picture == 238).all(axis=2))) > 500, "the missing frame is a grey field"

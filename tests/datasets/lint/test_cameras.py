@@ -197,16 +197,3 @@ def test_no_camera_of_a_healthy_capture_is_blamed(noise, painted, tmp_path):
     capture.each_parameters(err)
     add_noise(capture)
     assert not RIG_CODES & findings(capture.union).keys()
-
-
-def test_a_single_camera_is_compared_with_no_other(painted, tmp_path):
-    """A black one is still told, by its own images."""
-    capture = painted(2, 4).copied(tmp_path / "rig")
-    for part in ("train", "val", "test"):
-        capture.edit(
-            f"transforms_{part}.json",
-            lambda v: v.update(frames=[f for f in v["frames"] if f["camera_id"] == "222200000"]),
-        )
-    assert not RIG_CODES & findings(capture.union).keys()
-    change_images(capture, np.zeros_like)
-    assert RIG_CODES & findings(capture.union).keys() == {"HB308"}

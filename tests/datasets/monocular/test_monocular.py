@@ -4,7 +4,6 @@ import json
 import shutil
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -146,28 +145,6 @@ def test_the_convention_is_350_frames_of_at_least_700(frames, held_out):
     assert _last(frames, None)[0] == held_out
 
 
-def test_the_order_of_the_json_means_nothing(written, copied):
-    folder = copied("insta, meshes")
-    edit_json(folder / "transforms.json", lambda document: document["frames"].reverse())
-    one, other = open_clip(folder), open_clip(folder_of(written, "insta, meshes"))
-    assert one.splits["train"] == tuple(key._replace(subject="copied") for key in other.splits["train"])
-    np.testing.assert_array_equal(one.poses[7].rotation, other.poses[7].rotation)
-
-
-def test_images_without_alpha_are_composited_by_matted(written, copied):
-    folder = copied("insta")
-    truth = open_clip(folder_of(written, "insta"))
-    (folder / "matted").mkdir()
-    for image in sorted((folder / "images").iterdir()):
-        shutil.copy(image, folder / "matted" / image.name)
-        pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
-        pixels[pixels[..., 3] == 0] = [30, 60, 90, 0]
-        cv2.imwrite(str(image), pixels[..., :3])
-    clip = open_clip(folder)
-    for key in truth.splits["train"]:
-        np.testing.assert_array_equal(clip.image(key._replace(subject="copied")), truth.image(key))
-
-
 def test_each_reader_takes_its_own_folders(written, pristine_capture):
     assert find_reader(folder_of(written, "insta")).name == "monocular"
     assert find_reader(written / "imavatar").name == "monocular"
@@ -273,14 +250,6 @@ def test_faults_are_named(copied, fault):
     plant(folder)
     with pytest.raises(InputError, match=message):
         read_video(folder, progress=no_progress)
-
-
-def test_short_coefficients_are_padded_and_zeros_cut(copied):
-    folder = copied("imavatar")
-    for expression in ([0.5, -1.0, *[0.0] * 48], [0.5, -1.0]):
-        for file in folder.glob("MVI*/flame_params.json"):
-            edit_json(file, lambda document, new=expression: each(document, expression=new))
-        np.testing.assert_array_equal(read_video(folder).poses[0].expression, [0.5, -1.0, *[0.0] * 6])
 
 
 def write_vhap(folder, count=10):

@@ -14,7 +14,7 @@ import pytest
 from headbench.bench import cli
 from headbench.bench.contracts import Frame, no_progress
 from headbench.bench.engine.stored import StoredAvatar, avatar_folder
-from headbench.bench.errors import HeadbenchError, InputError
+from headbench.bench.errors import InputError
 from headbench.bench.io.images import write_png
 from headbench.bench.specs import MethodSpec, ResolutionRule
 from headbench.datasets.head.arrays import save_head
@@ -213,25 +213,12 @@ def test_frames_that_would_be_refused_are_not_encoded(frames, ffmpeg, tmp_path, 
     assert not (tmp_path / "out.zip").exists()
 
 
-def test_tracking_tells_how_many_frames_there_are(frames, ffmpeg, head, tmp_path):
-    ffmpeg()
-    with pytest.raises(InputError, match="FREE, camera 222200037: expected 2 frames, found 3"):
-        written(frames, tmp_path / "out.zip", data=str(write_benchmark(tmp_path / "data", head)))
-
-
 def test_without_the_encoder_it_says_where_to_get_it(frames, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     words = ["submission", "write", str(frames), str(tmp_path / "out.zip"), "--track", MONO.name]
     assert cli.main(words) == 3
     assert "apt-get install ffmpeg" in capsys.readouterr().out
-    assert not (tmp_path / "out.zip").exists()
-
-
-def test_an_encoder_that_fails_is_quoted(frames, ffmpeg, tmp_path):
-    ffmpeg(fails=True)
-    with pytest.raises(HeadbenchError, match="ffmpeg failed: no such encoder"):
-        written(frames, tmp_path / "out.zip")
     assert not (tmp_path / "out.zip").exists()
 
 
@@ -264,13 +251,6 @@ def test_what_the_server_would_refuse_is_named(track, tmp_path, says):
     assert any(line.startswith("README.txt") for line in issues.noted)
     assert len(issues.refused) == bool(says)
     assert re.search(says, "".join(issues.refused)), issues.refused
-
-
-def test_what_is_no_zip_is_bad_input(track, tmp_path):
-    (tmp_path / "no.zip").write_bytes(b"PK nothing")
-    for name in ("no.zip", "nowhere.zip"):
-        with pytest.raises(InputError, match=name):
-            check_submission(tmp_path / name, None, "", no_progress)
 
 
 def test_the_cost_of_the_codec_is_that_of_unrelated_errors():

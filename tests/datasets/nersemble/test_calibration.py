@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from headbench.bench.errors import InputError
-from headbench.datasets.nersemble.names import FULL_SIZE
 from headbench.datasets.nersemble.recording import read_calibration
 
 from .recordings import HEIGHT, WIDTH, world_cameras
@@ -77,10 +76,6 @@ def test_intrinsics_scale_with_the_edges_of_the_image(file):
     full = original.K @ (original.world_to_camera @ point)[:3]
     half = camera.K @ (camera.world_to_camera @ point)[:3]
     np.testing.assert_allclose(half[:2] / half[2], full[:2] / full[2] / 2, atol=1e-12)
-
-
-def test_without_a_size_the_intrinsics_mean_full_frames(file):
-    assert read_calibration(write(file, width=None, height=None)).size == FULL_SIZE
 
 
 def test_per_camera_intrinsics_mean_the_images_as_they_are(file):

@@ -97,13 +97,6 @@ def test_the_identity_changes_no_level(count):
             np.testing.assert_array_equal(kind(nearly)(ALL_LEVELS), ALL_LEVELS)
 
 
-@pytest.mark.parametrize("rows", [3, 4])
-def test_affine_files_are_read(rows, tmp_path):
-    matrix = np.arange(4.0 * rows).reshape(rows, 4) / 10
-    np.save(tmp_path / "1.npy", matrix)
-    np.testing.assert_array_equal(affine_correction(tmp_path / "1.npy").matrix, matrix[:3])
-
-
 @pytest.mark.parametrize(
     "content",
     [

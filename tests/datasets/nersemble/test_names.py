@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from headbench.bench.errors import InputError
 from headbench.datasets.nersemble import names
 from headbench.datasets.nersemble.names import SEQUENCES, match_sequence, numbered, serial_of
-from headbench.datasets.synthetic.plan import SERIALS
 
 
 @pytest.mark.parametrize(
@@ -56,14 +55,6 @@ def test_the_seeded_rule_holds_out_the_known_sequence():
     for line in HELD_OUT:
         subject, held_out = line.split()
         assert names.union10_held_out(subject).startswith(f"{held_out}-")
-
-
-def test_presets_name_what_exists():
-    assert set(names.PAPER_SEQUENCES) <= set(SEQUENCES)
-    assert len(SEQUENCES) == len(set(SEQUENCES)) == 26
-    assert SERIALS[8] == names.NOVEL_VIEW_CAMERA
-    assert names.ABLATION_SUBJECT not in names.SUBJECTS
-    assert len(names.SUBJECTS) == 9
 
 
 def test_subjects_of_an_option():

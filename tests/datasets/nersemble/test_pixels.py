@@ -1,13 +1,11 @@
 """Shrinking, compositing, un-blending, correcting: against float64 area means and a known composite."""
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
-from headbench.bench.errors import InputError
-from headbench.datasets.nersemble.pixels import AffineCorrection, prepare_pixels, read_still
+from headbench.datasets.nersemble.pixels import AffineCorrection, prepare_pixels
 
 FRAMES = arrays(np.uint8, (8, 12, 3))
 
@@ -78,18 +76,3 @@ def test_colours_are_corrected_before_the_composite():
     np.testing.assert_array_equal(reduced[0], [255, 0])
     plain, _ = prepare_pixels(frame, None, (2, 2), correction)
     np.testing.assert_array_equal(plain[0, 0], [100, 91, 30])
-
-
-def test_stills_take_the_size_of_the_frames(tmp_path):
-    path = tmp_path / "image_1.png"
-    still = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
-    cv2.imwrite(str(path), still)
-    np.testing.assert_array_equal(read_still(path, (12, 8)), still)
-    assert np.abs(read_still(path, (6, 4)) - area_mean(still, 2)).max() <= 0.5
-
-
-def test_damaged_stills_are_refused(tmp_path):
-    (tmp_path / "damaged.jpg").write_bytes(b"\xff\xd8\xff")
-    for name in ("none.jpg", "damaged.jpg"):
-        with pytest.raises(InputError, match=name):
-            read_still(tmp_path / name, (4, 4))

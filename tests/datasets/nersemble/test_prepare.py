@@ -1,8 +1,6 @@
 """The whole way from raw recordings to captures: what comes out, resuming, refusing, full disks."""
 
 import errno
-import json
-import tracemalloc
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -13,9 +11,6 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.files import write_json
-from headbench.bench.io.lock import locked
-from headbench.datasets.ga import writer
-from headbench.datasets.ga.layout import SPLIT_FILES
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
 from headbench.datasets.head.subject import PosedSubject
@@ -132,19 +127,6 @@ def test_earlier_releases_show_the_same_frames(release, images, clip, tmp_path):
         assert np.abs(shown - expected).max() <= 8
 
 
-def test_a_sequences_files_are_those_of_vhap(whole):
-    """Keys of the JSONs are tested with their writer; here is what a raw recording adds."""
-    folder = next(whole[0].glob(f"{SUBJECT}_FREE_*"))
-    first, backup = (
-        json.loads((folder / f"transforms{part}.json").read_text())["frames"][0] for part in ("", "_backup")
-    )
-    assert [*backup, "flame_param_path"] == [*first]
-    # cy counts from the bottom edge of the calibration's image.
-    assert first["cy"] == pytest.approx((HEIGHT - world_cameras()[0].K[1, 2]) / 2)
-    names = {path.name for path in folder.iterdir()}
-    assert {"images", "fg_masks", "flame_param", "canonical_flame_param.npz", "transforms_val.json"} <= names
-
-
 def test_a_finished_call_does_nothing(whole, pristine_recording, monkeypatch):
     out, first = whole
     before = contents(out)
@@ -172,17 +154,6 @@ def test_a_broken_run_continues_and_ends_the_same(whole, pristine_recording, tmp
     assert contents(out) == contents(whole[0])
 
 
-def test_a_full_disk_at_the_metadata_leaves_no_capture(pristine_recording, whole, tmp_path):
-    out = tmp_path / "out"
-    val = SPLIT_FILES["novel_view"]
-    error_of_a_full_disk(writer, "write_json", lambda path: path.name == val, pristine_recording, out)
-    assert not [*out.glob("UNION*/transforms*.json")]
-    with pytest.raises(InputError):
-        read_capture(next(out.glob(f"{SUBJECT}_EMO*")))
-    prepared(pristine_recording, out)
-    assert contents(out) == contents(whole[0])
-
-
 def test_broken_and_missing_images_are_made_again(whole, pristine_recording, tmp_path):
     out = tmp_path / "out"
     prepared(pristine_recording, out, workers=1)  # the same bytes come out with any number
@@ -201,12 +172,6 @@ def test_broken_and_missing_images_are_made_again(whole, pristine_recording, tmp
     cv2.imwrite(str(folder / "images" / "00004_00.png"), np.zeros((4, 4, 3), np.uint8))
     prepared(pristine_recording, out)
     assert contents(out) == contents(whole[0])
-
-
-def test_a_subject_is_prepared_by_one_process_at_a_time(whole, pristine_recording, tmp_path):
-    union = tmp_path / whole[1].data[SUBJECT]["union"].name
-    with locked(union, beside=True), pytest.raises(InputError, match="no other process"):
-        prepared(pristine_recording, tmp_path)
 
 
 @pytest.mark.parametrize("change", [{"downscale": 4}, {"every": 2}, {"edges": "plain"}, {"colour": "none"}])
@@ -254,15 +219,6 @@ def test_without_tracking_images_come_first_and_parameters_later(whole, pristine
     assert contents(out) == contents(whole[0])
 
 
-def test_tracking_of_some_sequences_only_does_not_pass(recording, tmp_path):
-    folder = next(recording.tracking.glob("*FREE*"))
-    folder.rename(folder.with_name("902_FREE"))
-    result, findings = prepared(recording, tmp_path / "out")
-    assert not findings.passed
-    assert "FREE" in result["missing"][0]
-    assert result["union"] is None
-
-
 def test_new_tracking_replaces_the_old_and_keeps_the_images(recording, whole, tmp_path):
     out = tmp_path / "out"
     union = prepared(recording, out)[0]["union"]
@@ -280,14 +236,6 @@ def test_new_tracking_replaces_the_old_and_keeps_the_images(recording, whole, tm
     shift = moved.poses[first].translation - still.poses[first].translation
     np.testing.assert_allclose(shift, [0, 0.5, 0], atol=1e-6)
     np.testing.assert_array_equal(moved.poses[0].translation, still.poses[0].translation)
-
-
-def test_images_are_never_enlarged(recording, tmp_path):
-    edit_json(recording.calibration_file, lambda value: value.update(height=2 * HEIGHT, width=2 * WIDTH))
-    with pytest.raises(InputError) as error:
-        prepared(recording, tmp_path / "out", downscale=1)
-    assert error.value.key == "downscale"
-    assert prepared(recording, tmp_path / "out", downscale=2)[0]["written"] == IMAGES
 
 
 def test_other_heads_and_frames_are_refused_before_any_work(recording, tmp_path):
@@ -370,18 +318,3 @@ def test_bad_options_are_named(change, key, pristine_recording, tmp_path):
         prepare_nersemble(pristine_recording.settings(tmp_path / "out", **change))
     assert error.value.key == key
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_the_length_of_a_recording(tmp_path):
-    peaks = []
-    for frames in (6, 60):
-        sequences = {"EMO-1-shout+laugh": frames, "FREE": 2}
-        recording = write_recording(
-            tmp_path / str(frames), images=False, sequences=sequences, size=(800, 800)
-        )
-        tracemalloc.start()
-        prepared(recording, tmp_path / f"out-{frames}", downscale=1, workers=2)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[1] - peaks[0] < 10 * 800 * 800 * 3, "as much as ten of the 54 frames more"

@@ -74,15 +74,6 @@ def test_the_metadata_says_what_to_fetch(recording):
         assert (f"metadata_sequences.csv lists {name}" in str(error.value)) == listed
 
 
-@pytest.mark.parametrize("content", [b"subject,EMO\n1,x\n", b"ID,EMO\n\xff\xfe,x\n"])
-def test_faulty_metadata_are_refused(content, recording):
-    path = recording.root / "metadata_sequences.csv"
-    path.write_bytes(content)
-    with pytest.raises(InputError) as error:
-        participants(recording.root)
-    assert error.value.file == str(path)
-
-
 def test_other_folders_and_missing_files_are_refused(recording, tmp_path):
     (tmp_path / "other" / "images").mkdir(parents=True)
     for name in ("nowhere", "other"):

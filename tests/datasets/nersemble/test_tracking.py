@@ -82,13 +82,6 @@ def test_parameters_that_do_not_fit_are_named(changes, key, head, tmp_path):
     assert (error.value.file, error.value.key) == (str(path), key)
 
 
-def test_a_truncated_file_is_named(head, tmp_path):
-    path = written(tmp_path / "t.npz", head)
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(InputError, match=str(path)):
-        read_tracked(path, timesteps=COUNT)
-
-
 def place(root, name):
     path = root / name
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -117,13 +117,3 @@ def test_damage_is_found(damage, download):
     findings = check(download)
     assert not findings.passed
     assert str(path.name) in findings.data[SUBJECT]["fault"]
-
-
-def test_another_test_sequence_is_noted(download):
-    train, test = (next(download.glob(f"UNION10*/transforms_{part}.json")) for part in ("train", "test"))
-    trained, tested = train.read_bytes(), test.read_bytes()
-    train.write_bytes(tested)
-    test.write_bytes(trained)
-    findings = check(download)
-    assert findings.passed
-    assert any(union10_held_out(SUBJECT) in note for note in findings.data[SUBJECT]["notes"])

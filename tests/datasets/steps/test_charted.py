@@ -35,13 +35,6 @@ def test_the_two_directions_are_18_degrees_from_orthogonal():
     assert abs(lengths[1] / lengths[0] * np.cos(np.radians(18)) - 1) < 1e-5  # nothing but sheared
 
 
-def test_triangles_without_area_have_none_in_the_chart():
-    corners = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
-    uv = packed_chart(corners, np.array([[0, 1, 2], [2, 3, 4]])).astype(np.float64)
-    assert np.isfinite(uv).all()
-    assert area(uv)[0] == 0 < area(uv)[1]
-
-
 def test_a_clip_gets_a_chart_once(clip):
     charted = with_packed_chart(clip, CONFIG)
     assert charted.head.uv.shape == (len(clip.head.faces), 3, 2)

@@ -14,7 +14,6 @@ from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.steps import clusters as module
 from headbench.datasets.steps.clusters import (
     classes_of,
-    cluster_by_distance,
     cluster_expressions,
     exact_embedding,
     expression_displacements,
@@ -112,17 +111,6 @@ def test_short_performances_have_no_more_classes_than_timesteps(train, classes):
     assert labels.max() == classes - 1
 
 
-def test_chains_of_equal_mean_are_told_apart():
-    """Two chains of equal mean: what spectral clustering is for."""
-    distances = np.full((20, 20), 10.0)
-    for start in (0, 10):
-        index = np.arange(10)
-        distances[start : start + 10, start : start + 10] = np.abs(index[:, None] - index) * 0.5
-    labels, _ = cluster_by_distance(distances, 2)
-    assert len(set(labels[:10])) == len(set(labels[10:])) == 1
-    assert labels[0] != labels[10]
-
-
 @pytest.mark.parametrize("limit", [5, 20])
 @pytest.mark.parametrize("faces", [1, 2])
 def test_no_more_classes_than_distinct_faces(limit, faces):
@@ -130,15 +118,6 @@ def test_no_more_classes_than_distinct_faces(limit, faces):
     clip = with_poses(make_clip(20), expression=lambda t: np.full(8, float(t % faces)), **still)
     labels = cluster_expressions(clip, limit=limit).labels
     assert len(set(labels)) == len({*zip(labels, np.arange(20) % faces)}) == faces
-
-
-@pytest.mark.parametrize("seeds", [{"seed": 0, "limit": 20}, {"seed": 1}], ids=["landmarks", "all pairs"])
-def test_the_same_seed_or_all_pairs_give_the_same_classes(seeds):
-    clip = make_clip(50)
-    one, other = (
-        cluster_expressions(clip, 6, **{"seed": 0, **choice}) for choice in (seeds, {**seeds, "seed": 0})
-    )
-    np.testing.assert_array_equal(one.labels, other.labels)
 
 
 def random_meshes(count, vertices=7, seed=0):
@@ -250,16 +229,6 @@ def test_nystrom_with_all_items_as_landmarks_is_exact(count):
     np.testing.assert_allclose(found, values, atol=1e-7)
 
 
-def test_nystrom_is_exact_for_copies_of_the_landmarks():
-    """Items that repeat the landmarks add no rank, so that nothing is lost but the links among copies."""
-    points = np.random.default_rng(2).normal(size=(15, 3))[np.arange(150) % 15]
-    similarity = similarity_of(points)
-    found = nystrom_embedding(similarity[:, :15], np.arange(15), 5)
-    np.testing.assert_allclose(
-        projector(found, similarity), projector(exact_embedding(similarity, 5), similarity), atol=1e-8
-    )
-
-
 def test_classes_of_separate_blobs_and_no_empty_class():
     rng = np.random.default_rng(4)
     truth = rng.integers(0, 7, size=3000)  # more than the hierarchy is made of
@@ -268,7 +237,3 @@ def test_classes_of_separate_blobs_and_no_empty_class():
     assert adjusted_rand_score(truth, labels) == 1
     assert sorted(set(labels.tolist())) == list(range(7))
     np.testing.assert_array_equal(labels, classes_of(embedding, 7))
-
-
-def test_similarity_is_linear_and_bounded_below():
-    np.testing.assert_allclose(similarities(np.array([[0.0, 1.0, 2.0]]), 2.0), [[1, 0.5, 1e-6]])

@@ -180,14 +180,3 @@ def test_timesteps_are_decimal_numbers(tmp_path, line, read):
         return
     with pytest.raises(InputError):
         read_exclusions(path)
-
-
-@pytest.mark.parametrize(
-    ("written", "read"), [*(({1: word}, {1: "keep"}) for word in ("Keep", "KEEP", " keep ")), (None, {})]
-)
-def test_keep_however_it_is_written_and_an_emptied_section(tmp_path, written, read):
-    path = tmp_path / "tongue.yaml"
-    path.write_text(_faulty("subjects.900.overrides", written))
-    found = read_exclusions(path)["900"]
-    assert found.overrides == read
-    assert found.reasons() == {}

@@ -114,14 +114,3 @@ def test_what_cannot_be_done_is_said_before_any_work(clip, heads, tmp_path):
     ):
         with pytest.raises(InputError, match=said):
             clip_for_method(clip, MethodNeeds(**needs), at_hand)
-
-
-def test_the_procedural_heads_need_no_file(clip, monkeypatch):
-    made: list[str] = []
-    monkeypatch.setattr(for_method, "procedural_head", lambda version: made.append(version) or OTHER)
-    procedural = replace(clip, head=replace(clip.head, version="procedural2023"))
-    needs = MethodNeeds(head_models=("flame2020", "procedural2020"))
-    clip_for_method(procedural, needs, {})
-    assert made == ["procedural2020"]
-    with pytest.raises(InputError, match="head_models"):
-        clip_for_method(clip, needs, {})  # a FLAME capture is not refitted to the procedural head

@@ -152,17 +152,6 @@ def test_the_neck_line_follows_the_head_in_every_view(view, normal):
     assert neck_line(camera, anchors - 9 * view[2, :3]) is None  # behind the camera
 
 
-def test_anchors_lie_where_their_names_say(clip):
-    front, left, right, top = clip.head.template[neck_anchors(clip.head)]
-    neck = clip.head.template[clip.head.regions["neck"]]
-    assert front[2] > 0.015
-    assert abs(front[0]) < 1e-6
-    assert left[0] > 0.015
-    assert right[0] < -0.015
-    assert top[1] == clip.head.template[:, 1].max()
-    assert max(front[1], left[1], right[1]) <= np.median(neck[:, 1])
-
-
 def test_images_and_masks_end_below_the_line_through_the_neck(clip, tmp_path):
     noise = np.random.default_rng(0).integers(0, 200, (64, 48, 3)).astype(np.uint8)
     clip = with_pixels(clip, tmp_path, noise, np.full((64, 48), 255, np.uint8))

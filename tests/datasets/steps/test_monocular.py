@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from headbench.bench.engine.config import RunConfig
-from headbench.bench.specs import ResolutionRule
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.steps.for_method import as_single_video
-from headbench.datasets.steps.resolution import align_clip
 from headbench.datasets.steps.rigid import as_rigid_head
 
 from ..tiny_capture import projected
@@ -78,15 +76,6 @@ def test_the_mesh_projects_where_it_did(clip, video):
         assert not np.any([pose.rotation, pose.neck, pose.translation])
         assert np.array_equal(pose.expression, clip.poses[old.timestep].expression)
         assert pose.timestep == new.timestep
-
-
-def test_pixel_steps_before_and_after_see_the_same_frames(clip):
-    rule = ResolutionRule(divide=2)
-    before = as_single_video(align_clip(clip, rule))
-    after = align_clip(as_single_video(clip).clip, rule)
-    for key in before.clip.splits["self_reenactment"]:
-        assert np.array_equal(before.clip.image(key), after.image(key))
-        assert np.allclose(before.clip.cameras[key.camera].K, after.cameras[key.camera].K)
 
 
 def test_a_rigid_head_follows_no_neck(clip):

@@ -8,19 +8,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from matplotlib import rc_context
 from scipy.spatial.transform import Rotation
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
-from headbench.datasets import figures
 from headbench.datasets.figures import new_figure, pixels
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.steps.clusters import cluster_expressions
 from headbench.datasets.steps.figures import (
     cluster_colour,
-    draw_clusters,
-    draw_jaw_bases,
     draw_meshes,
     draw_strips,
     find_jaw_bases,
@@ -81,23 +76,6 @@ def test_the_medoids_camera_is_the_one_the_face_looks_at(clip):
         assert frontal_key(looking, timestep).camera == name
 
 
-def test_a_matplotlibrc_changes_no_figure():
-    def drawn():
-        with new_figure(2, 1) as figure:
-            figure.suptitle("title")
-            return pixels(figure)
-
-    expected = drawn()
-    with rc_context({"text.usetex": True, "font.size": 30, "figure.facecolor": "red"}):
-        np.testing.assert_array_equal(drawn(), expected)
-
-
-def test_a_figure_longer_than_matplotlib_draws_becomes_smaller(monkeypatch):
-    monkeypatch.setattr(figures, "LONGEST", 150)
-    with new_figure(2, 1) as figure:
-        assert pixels(figure).shape == (75, 150, 3)
-
-
 def test_strips_show_the_cluster_of_each_timestep_in_order():
     with new_figure(6, 2) as figure:
         axes = figure.subplots()
@@ -135,11 +113,3 @@ def test_command_writes_pictures_and_numbers(pristine_capture, tmp_path, variant
         picture = cv2.imread(str(tmp_path / name))
         assert picture is not None
         assert picture.std() > 10
-
-
-def test_a_clip_with_one_timestep_still_has_figures(clip):
-    first = clip.timesteps("train")[0]
-    train = tuple(key for key in clip.splits["train"] if key.timestep == first)
-    single = clip.derive("test", {}, splits={**clip.splits, "train": train, "self_reenactment": ()})
-    assert draw_clusters(single, cluster_expressions(single)).std() > 5
-    assert draw_jaw_bases(single, find_jaw_bases(single)).std() > 5

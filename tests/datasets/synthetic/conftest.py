@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
+from headbench.datasets.synthetic import renderer as renderer_module
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.datasets.synthetic.history import over_time
 from headbench.datasets.synthetic.performance import CONTROLS
@@ -43,15 +44,31 @@ def plan(geometry, tmp_path_factory):
     return plan_subject(Path(tmp_path_factory.mktemp("plan")), 0, geometry, settings)
 
 
-@pytest.fixture(scope="session")
-def subject(plan):
-    return RenderedSubject(plan.person, plan.geometry, plan.shape)
+@pytest.fixture(scope="session", autouse=True)
+def made_once():
+    """A rendered subject takes 1.5 s to make and never changes: tests share one of each person."""
+    made = {}
+
+    def subject(person, geometry, shape, correctives=0.0):
+        key = repr(person), geometry.source, np.asarray(shape).tobytes(), correctives
+        if key not in made:
+            made[key] = RenderedSubject(person, geometry, shape, correctives)
+        return made[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(renderer_module, "RenderedSubject", subject)
+        yield
 
 
 @pytest.fixture(scope="session")
 def renderer(plan):
     """One renderer that tests share, each of which poses it first."""
     return CaptureRenderer(plan)
+
+
+@pytest.fixture(scope="session")
+def subject(renderer):
+    return renderer._subject
 
 
 @pytest.fixture

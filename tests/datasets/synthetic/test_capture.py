@@ -151,18 +151,6 @@ def test_bad_settings_are_refused_before_anything_is_written(tmp_path, change):
     assert not out.exists()
 
 
-def test_the_capture_is_marked_as_synthetic(capture):
-    out, union, _ = capture
-    readme = (out / "README.txt").read_bytes()  # folders of earlier versions must not be refused for another
-    assert hashlib.sha256(readme).hexdigest().startswith("5347bcea74156ae3")
-    assert json.loads((union / "headbench.json").read_text())["synthetic"]["seed"] == 0
-    assert "digitalsourcetype/algorithmicMedia<" in (out / "provenance.xmp").read_text()
-    clip = read_capture(union)
-    key = clip.splits["novel_view"][0]
-    assert np.ptp(clip.image(key)) > 100
-    assert 0.15 < (clip.mask(key) > 128).mean() < 0.9
-
-
 def content(path):
     """What a file of a capture holds, whatever library packed it."""
     if path.suffix == ".png":
@@ -178,6 +166,7 @@ def content(path):
 def test_a_small_capture_has_the_same_bytes_on_every_machine(capture):
     """A change of what captures show is a new `EDITION`, with new digests here. XMP states headbench's version."""
     out, found = capture[0], {}
+    assert "digitalsourcetype/algorithmicMedia<" in (out / "provenance.xmp").read_text()
     for path in sorted(path for path in out.rglob("*.*") if path.suffix != ".xmp"):
         kind = found.setdefault(path.suffix, hashlib.sha256())
         kind.update(path.relative_to(out).as_posix().encode() + content(path))

@@ -62,14 +62,6 @@ def test_a_still_head_is_not_left(rest):
         assert late == {**rest, "head_turn": 0.125, "jaw_open": 0.2}
 
 
-def test_the_amount_scales_the_distance_to_the_head():
-    whole, half, none = (
-        follow(stepping, STEP + 0.05, amount, LENGTH).hair["head_turn"] for amount in (1.0, 0.5, 0.0)
-    )
-    assert none == 0.25
-    assert 0.25 - half == pytest.approx(0.5 * (0.25 - whole))
-
-
 def test_long_hair_swings_as_slowly_as_a_rod_of_its_length():
     """The period of a thin rod about its end, by the integral of small swings of two thirds of its length."""
     assert 1.0 / hair_frequency(0.3) == pytest.approx(2.0 * np.pi * np.sqrt(0.2 / 9.81))

@@ -76,13 +76,6 @@ def test_expressions_change_skin_beyond_the_tracked_mesh(plan, subject, rest, fa
         assert 0.0002 < lift.max() < 0.005
 
 
-def test_poses_are_what_is_stored(plan):
-    for poses in plan.poses.values():
-        for pose in poses:
-            for values in (pose.expression, pose.jaw, pose.neck, pose.rotation, pose.eyes, pose.translation):
-                np.testing.assert_array_equal(values, values.astype(np.float32))
-
-
 def test_dynamics_scale_folds_and_colour_changes(plan, subject, rest):
     """Folds and logarithms of colour factors are proportional to it; at 0 skin stays as it is."""
     points = subject._rest_points[::50]

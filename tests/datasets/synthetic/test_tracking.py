@@ -181,25 +181,3 @@ def test_eyes_jaw_and_distance_jitter_as_recorded(video, field, columns, low, hi
     off = [(a - b)[:, columns] for a, b in zip(stacked(tracked, field), stacked(exact, field))]
     jitter = np.mean([np.diff(each, 3, axis=0).std() / np.sqrt(20) for each in off])
     assert low < jitter < high
-
-
-def test_errors_of_videos_depend_on_time_not_on_the_frames_kept(video):
-    """The share of the variance that is left after 0.33 s, found in every frame and in every eighth."""
-
-    def remembered(every, lag):
-        exact, tracked = video(every, 1600 // every)
-        off = [a - b for a, b in zip(stacked(tracked, "rotation"), stacked(exact, "rotation"))]
-        return sum((e[lag:] * e[:-lag]).sum() / (len(e) - lag) for e in off) / sum(
-            (e * e).sum() / len(e) for e in off
-        )
-
-    assert remembered(8, 1) == pytest.approx(remembered(1, 8), abs=0.1)
-
-
-def test_part_of_the_error_lasts_for_a_sequence(video):
-    exact, tracked = (stacked(each, "expression") for each in video(8, 60))
-    spread = np.concatenate(exact).std(axis=0)
-    used = spread > 1e-3
-    means = [((a - b).mean(axis=0) / np.maximum(spread, 1e-9))[used] for a, b in zip(tracked, exact)]
-    between = np.std(means, axis=0)  # over sequences
-    assert 0.15 < np.sqrt((between**2).mean()) < 0.6

@@ -173,41 +173,6 @@ def test_images_without_masks_are_imported_with_a_warning(copied, tmp_path):
     assert not any(clip.has_mask(key) for key in clip.files)
 
 
-def test_folders_and_numbers_are_given(copied, tmp_path):
-    source = copied("flashavatar")
-    pictures = tmp_path / "dataset" / "me"
-    for name in ("imgs", "alpha", "parsing"):
-        (source / name).rename((pictures.mkdir(parents=True, exist_ok=True) or pictures) / name)
-    first = imported(
-        source / "checkpoint", tmp_path / "a", images=str(pictures), head=str(source / HEAD_FILE)
-    )
-    assert first.data["first_image"] == 1
-    (pictures / "imgs").rename(pictures / "frames")  # a name that says nothing about numbers
-    masks = {"images": str(pictures / "frames"), "masks": str(pictures / "alpha")}
-    second = imported(source, tmp_path / "b", **masks, first_image=1)
-    assert second.data["masks"] == "alpha"
-    frames = pictures / "frames"
-    shutil.copy(frames / "00001.jpg", frames / "00000.jpg")
-    shutil.copy(pictures / "alpha" / "00001.jpg", pictures / "alpha" / "00000.jpg")
-    third = imported(source, tmp_path / "c", **masks)
-    assert third.data["first_image"] == 0  # the lowest number
-    assert "1 image without a tracked frame" in third.text
-
-
-def test_the_folder_is_the_current_one(written, tmp_path, monkeypatch):
-    monkeypatch.chdir(written["pixel3dmm"] / "checkpoint")
-    settings = ImportTrackingSettings(".", "../head.npz", str(tmp_path / "out"))
-    assert import_tracking(settings).data["images"].endswith("/cropped")
-
-
-def test_flashavatars_images_come_before_the_trackers(written, copied, tmp_path):
-    source = copied("flashavatar")
-    shutil.copytree(written["metrical"] / "input", source / "input", dirs_exist_ok=True)
-    data = imported(source, tmp_path / "out").data
-    assert data["images"].endswith("/imgs")
-    assert data["masks"] == "alpha times parsing"
-
-
 def test_coefficients_fit_the_bases_of_the_head(recordings, copied, tmp_path):
     source = copied("metrical")
     save_head(tmp_path / "large.npz", toy_head(16, shape_size=310, expression_size=120))
@@ -219,12 +184,6 @@ def test_coefficients_fit_the_bases_of_the_head(recordings, copied, tmp_path):
     with pytest.raises(InputError, match="at most 3 coefficients"):
         imported(source, tmp_path / "b", head=str(tmp_path / "small.npz"))
     assert not (tmp_path / "b").exists()
-
-
-def test_a_capture_of_a_reader_needs_no_import(capture, tmp_path):
-    with pytest.raises(InputError, match="a capture that the reader ga reads") as caught:
-        imported(capture.union, tmp_path / "out")
-    assert "headbench lint" in caught.value.remedy
 
 
 class Code:

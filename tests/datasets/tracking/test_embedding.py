@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from headbench.bench.errors import InputError
 from headbench.bench.landmark_network import COUNT
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.tracking.embedding import learn_embedding
@@ -59,10 +58,3 @@ def test_landmarks_are_found_where_they_are(head, pictures, error, most):
     places = np.einsum("lk,lki->li", found.weights, template[found.corners])
     distance = np.linalg.norm(places - template[vertices[found.landmarks]], axis=1)
     assert np.median(distance) < most
-
-
-def test_a_network_that_sees_no_face_is_an_error(head, pictures):
-    network = Network(pictures, np.zeros(COUNT, int))
-    network.find = lambda image, near=None: None
-    with pytest.raises(InputError, match="found 0 landmarks"):
-        learn_embedding(network, head, pictures)

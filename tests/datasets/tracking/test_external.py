@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -210,16 +209,3 @@ def test_what_an_installation_lacks_is_said(settings, missing, kind):
     assert (
         f"no {kind}." if missing else f"checkout: {given.checkout}; environment: {given.python}"
     ) in found.text
-
-
-def test_options_that_do_not_fit_are_refused(settings, tmp_path):
-    for changes in ({"head": None}, {"python": "no-such-python"}, {"checkout": "/nowhere"}):
-        with pytest.raises(InputError, match=next(iter(changes)) + "|nowhere"):
-            track_capture(settings("vhap", **changes))
-    with pytest.raises(InputError, match="the file of a video"):
-        track_capture(replace(settings("vhap"), capture=str(tmp_path)))
-    for changes in ({"program": "vhap"}, {"checkout": "somewhere"}):
-        with pytest.raises(ValueError, match="need each other"):
-            TrackSettings("me.mp4", "out", **changes)
-    with pytest.raises(InputError, match=r"settings\.vhap\.chekout"):
-        doctor(DoctorSettings(set=("settings.vhap.chekout=x",)), no_progress)

@@ -46,15 +46,3 @@ def test_a_prior_of_0_keeps_a_parameter():
     assert found.shape[0] == 0.7
     assert found.poses[0, 1] == 0.3
     assert found.poses[0, 0] != 0.2
-
-
-def test_a_head_without_identities_takes_steps():
-    rng = np.random.default_rng(3)
-    equations = NormalEquations(2, 3, 0)
-    posed = PosedPoints(*(rng.standard_normal(size) for size in ((4, 3), (4, 3, 3), (4, 3, 0))))
-    slope = rng.standard_normal((4, 3))
-    equations.add(1, posed, np.tile(np.eye(3), (4, 1, 1)), slope)
-    found = equations.step(HeadState(np.zeros(0), np.zeros((2, 3))), HeadPrior(np.ones(3), np.zeros(0)), 0.0)
-    dense = posed.by_pose.reshape(-1, 3)
-    wanted = np.linalg.solve(dense.T @ dense + np.eye(3), dense.T @ slope.ravel())
-    np.testing.assert_allclose(found.poses, [np.zeros(3), wanted], atol=1e-6)

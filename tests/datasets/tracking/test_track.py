@@ -126,13 +126,6 @@ def test_what_is_missing_is_refused(clip):
             track(*given)
 
 
-def test_landmarks_are_seeded_and_wrong(clip):
-    cameras = [*clip.cameras]
-    one, two, other = (source(clip, cameras, seed)([0]).pixels for seed in (3, 3, 4))
-    np.testing.assert_array_equal(one, two)
-    assert np.nanmedian(np.abs(one - other)) > 0.3
-
-
 def test_spread_points_are_far_apart():
     points = np.random.default_rng(0).random((300, 3))
     chosen = points[spread_vertices(points, 20)]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.video.decode import is_video, probe_video, video_frames
+from headbench.datasets.video.decode import probe_video, video_frames
 
 
 def picture(index, width=64, height=48):
@@ -89,9 +89,3 @@ def test_what_is_no_whole_video_is_refused(tmp_path):
             list(video_frames(path))
     with pytest.raises(InputError, match="no such file"):
         list(video_frames(tmp_path / "none.mp4"))
-
-
-def test_videos_are_recognised_by_their_suffix(tmp_path):
-    (tmp_path / "a.MOV").write_bytes(b"")
-    (tmp_path / "b.png").write_bytes(b"")
-    assert [is_video(tmp_path / name) for name in ("a.MOV", "b.png", "c.mp4")] == [True, False, False]

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from headbench.bench.errors import InputError
 from headbench.bench.landmark_network import COUNT, face_size, same_face
 from headbench.datasets.video import faces
 from headbench.datasets.video.decode import TimedFrame
@@ -133,9 +132,3 @@ def test_landmarks_are_stored_meanwhile_for_a_kill(tmp_path, monkeypatch):
     found(tmp_path, STILL)
     assert [len(one["numbers"]) for one in stored] == [*range(1, 13), 12]
     assert [bool(one["finished"]) for one in stored] == [False] * 12 + [True]
-
-
-@pytest.mark.parametrize("shown", [[[]] * 4, [[face(50)]] + [[]] * 3, []])
-def test_too_few_frames_with_the_face_are_refused(tmp_path, shown):
-    with pytest.raises(InputError, match="me.mp4"):
-        found(tmp_path, shown)

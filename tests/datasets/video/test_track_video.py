@@ -240,13 +240,6 @@ def test_a_call_that_is_interrupted_repeatedly_is_continued(settings, filmed, mo
         assert (tmp_path / "out" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), file
 
 
-def test_frames_are_searched_again_with_another_option(settings, monkeypatch):
-    finished_calls(monkeypatch, settings(), "write_image", 4)
-    for changes, searched, written in (({"size": 100}, 0, 11), ({"longest": 9}, 7, 8)):
-        done, _ = finished_calls(monkeypatch, settings(**changes), "fit_colours", 0)
-        assert (done[0] > 0, done[2]) == (searched > 0, written)
-
-
 @pytest.mark.parametrize(("changed", "fitted"), [("focal", 1), ("code", 1), ("embedding", 0)])
 def test_what_another_call_left_is_used_where_it_fits(settings, monkeypatch, changed, fitted):
     assert finished_calls(monkeypatch, settings(), "write_json", 0)[1] is None
@@ -264,12 +257,6 @@ def test_what_another_call_left_is_used_where_it_fits(settings, monkeypatch, cha
     assert (counts["write_image"] > 0) == (counts["follow"] > 0) == (changed == "code")
     (camera,) = read_capture(result["capture"]).cameras.values()
     assert camera.K[0, 0] == pytest.approx(length, rel=1e-5)
-
-
-@pytest.mark.parametrize("changes", [{"focal": -1.0}, {"rate": 0.5}, {"size": 8}, {"longest": 0}])
-def test_settings_out_of_range_are_refused(changes):
-    with pytest.raises(ValueError, match=next(iter(changes))):
-        TrackSettings("me.mp4", "out", **changes)
 
 
 def test_a_crop_holds_every_face_and_moves_the_camera():

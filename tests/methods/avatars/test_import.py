@@ -93,18 +93,6 @@ def test_what_is_of_no_degree_or_on_no_triangle_is_refused(capture, tmp_path, ch
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_in_use_is_left_alone_an_own_one_is_continued(capture, tmp_path):
-    ply, other = (
-        ga_file(tmp_path / "in.ply", ROWS),
-        ga_file(tmp_path / "o.ply", [{**ROWS[0], "x": 0.5}, ROWS[1]]),
-    )
-    # The second as after a kill behind the last file.
-    assert imported(capture, tmp_path / "out", ply) == imported(capture, tmp_path / "out", ply)
-    for folder, file in ((tmp_path, ply), (tmp_path / "out", other)):
-        with pytest.raises(InputError, match="empty folder"):
-            imported(capture, folder, file)
-
-
 KEYS = ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
 
 

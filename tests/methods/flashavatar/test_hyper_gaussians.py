@@ -128,14 +128,6 @@ def test_a_coded_avatar_has_its_gaussians(trained, clip, tmp_path, precision, to
     assert coded.stored.settings.hyper_gaussians == LATENT
 
 
-def test_files_without_gaussians_say_nothing_of_them(clip, tmp_path):
-    plain = FlashAvatarTraining(clip, replace(CONFIG, hyper_gaussians=0), "cpu", 0).result()
-    plain.write(tmp_path / "avatar.safetensors")
-    tensors, metadata = read_safetensors(tmp_path / "avatar.safetensors")
-    assert not tensors.keys() & gaussian_shapes(LATENT).keys()
-    assert "hyper" not in metadata["settings"]
-
-
 def test_damaged_gaussians_are_refused(trained, clip, tmp_path):
     _, _, avatar = trained
     path = tmp_path / "avatar.safetensors"
@@ -151,9 +143,3 @@ def test_damaged_gaussians_are_refused(trained, clip, tmp_path):
     save_file({key: value for key, value in tensors.items() if key != name}, path, metadata)
     with pytest.raises(InputError, match=name):
         TrainedSplats.of(path, *read_safetensors(path), clip.head, "cpu")
-
-
-@pytest.mark.parametrize("latent", [-1, 129])
-def test_sizes_out_of_bounds_are_refused(latent):
-    with pytest.raises(ValueError, match="hyper_gaussians must be 0 to 128"):
-        FlashAvatarConfig(hyper_gaussians=latent)

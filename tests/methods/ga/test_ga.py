@@ -6,13 +6,15 @@ import torch
 from torch import nn
 
 from headbench.methods.ga.config import GAConfig
-from headbench.methods.ga.method import GAAppearance
+from headbench.methods.ga.method import GAAppearance, GAAvatar
 from headbench.methods.ops.harmonics import C0, C1
-from headbench.methods.shared.avatar_files import TRACKED
+from headbench.methods.shared.avatar_files import TRACKED, Subject
 from headbench.methods.shared.optimisation import Optimiser
 from headbench.methods.shared.rendering import view_of
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.subject_mesh import SubjectMesh
+
+from ..shared.test_avatar_files import tracking
 
 
 def make(clip, config=None):
@@ -94,3 +96,16 @@ def test_tracking_of_the_timestep_alone_is_refined_if_asked(clip, refine):
         for name in TRACKED:
             moved = optimiser[name].grad.abs().sum(1) > 0
             assert moved.nonzero().flatten().tolist() == [row]
+
+
+def test_an_avatar_shows_a_training_pose_as_it_was_refined(clip):
+    appearance, optimiser, binding = make(clip)
+    names = ("means", "log_scales", "quats", "opacities", "sh_dc", "sh_rest")
+    splats, refined = {name: optimiser[name].detach() for name in names}, tracking(clip)
+    plain, avatar = (
+        GAAvatar([], appearance._mesh, Subject.of(clip), splats, binding, each, "cpu")
+        for each in (None, refined)
+    )
+    for pose, shown in ((clip.poses[1], refined(clip.poses[1])), (clip.poses[2], clip.poses[2])):
+        np.testing.assert_array_equal(avatar.splats(pose).means, plain.splats(shown).means)
+    assert not np.array_equal(avatar.splats(clip.poses[1]).means, plain.splats(clip.poses[1]).means)

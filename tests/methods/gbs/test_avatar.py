@@ -79,14 +79,6 @@ def test_bytes_of_a_splat_are_fewer_than_published(tmp_path, share, moving):
     assert per_splat < PUBLISHED_BYTES
 
 
-def test_no_expressions_are_stored_and_read(tmp_path):
-    write(tmp_path / "x", expressions=0)
-    found = read(tmp_path / "x")
-    assert found.expressions == 0
-    assert len(found.differences) == 0
-    assert found.entries.sum(found.differences, torch.zeros(0)).shape == (30, 59)
-
-
 def cut(name):
     return lambda tensors: tensors.update({name: tensors[name][:-1].contiguous()})
 

@@ -199,8 +199,3 @@ def test_extreme_poses_are_finite_and_bounded(avatar, clip, part, value):
             assert np.isfinite(values).all()
         assert splats.scales.max() <= 0.1 + 1e-6
         check_frame(frame, view.width, view.height)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (3840, 2160)])
-def test_extreme_sizes_are_finite_and_bounded(avatar, clip, size):
-    check_frame(avatar.render(clip.cameras["00"].resized(*size), clip.poses[0]), *size)

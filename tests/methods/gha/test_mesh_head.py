@@ -20,7 +20,6 @@ from headbench.methods.gha.mesh_head import (
     MeshHead,
     TetGrid,
     marching_tetrahedra,
-    spacing_for,
     tet_grid,
     vertex_discs,
 )
@@ -222,12 +221,6 @@ def test_the_tetrahedra_fill_the_box_without_overlap():
     assert on_side.all()
 
 
-def test_spacing_gives_about_the_number_asked_for():
-    low, high = np.array([-1.0, -2.0, -1.5]), np.array([1.0, 1.8, 1.2])
-    grid = tet_grid(low, high, spacing_for(low, high, 20_000))
-    assert len(grid.vertices) == pytest.approx(20_000, rel=0.15)
-
-
 @settings(max_examples=4, deadline=None)
 @given(st.tuples(*[st.floats(0.5, 1.2)] * 3), st.tuples(*[st.floats(-0.05, 0.05)] * 3))
 def test_ellipsoids_have_their_area_and_volume(axes, center):
@@ -272,11 +265,3 @@ def test_gradients_by_the_signed_distances():
         return marching_tetrahedra(values, grid.tets).interpolate(places)
 
     assert torch.autograd.gradcheck(vertices, distance.requires_grad_(), eps=1e-6)
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_nothing_where_nothing_changes_sign(sign):
-    grid = box(1.0, 0.5)
-    crossings = marching_tetrahedra(torch.full((len(grid.vertices),), sign), grid.tets)
-    assert crossings.faces.shape == (0, 3)
-    assert crossings.interpolate(grid.vertices).shape == (0, 3)

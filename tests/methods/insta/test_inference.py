@@ -102,14 +102,6 @@ def test_what_is_seen_does_not_depend_on_the_number_of_threads(head):
         np.testing.assert_array_equal(one, other)
 
 
-def test_other_types_than_float32_take_the_definition(head):
-    stage = make(head)
-    doubled = {name: value.double() for name, value in stage.parameters.items()}
-    seen = stage._replace(parameters=doubled).seen("auto")
-    assert seen.color.dtype == np.float64
-    np.testing.assert_allclose(seen.color, stage.seen("auto").color, atol=2e-5, rtol=0)
-
-
 def test_huge_densities_and_features_stay_finite(head):
     stage = make(head)
     parameters = {name: 100 * value for name, value in stage.parameters.items()}
@@ -118,16 +110,3 @@ def test_huge_densities_and_features_stay_finite(head):
         assert np.isfinite(seen.color).all()
         assert seen.transmittance.min() >= 0
         assert seen.color.max() <= 1 + 1e-5
-
-
-def test_an_instruction_set_that_is_not_there_is_refused(head):
-    with pytest.raises(ValueError, match="abacus"):
-        make(head).seen("abacus")
-
-
-@pytest.mark.parametrize("name", ["table", "density_0", "color_0"])
-def test_parameters_that_do_not_fit_together_are_refused(head, name):
-    stage = make(head)
-    short = {**stage.parameters, name: stage.parameters[name][:-1, :-1]}
-    with pytest.raises(ValueError, match="fit together"):
-        stage._replace(parameters=short).seen("auto")

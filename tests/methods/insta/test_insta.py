@@ -72,13 +72,6 @@ def test_extreme_poses_and_views_stay_finite_and_bounded(trained, clip, head):
         check_frame(trained[1].render(replace(camera, world_to_camera=transform), pose), *size)
 
 
-def test_a_single_pixel_and_a_background(trained, clip):
-    camera, pose = first_view(clip)
-    check_frame(trained[1].render(camera.resized(1, 1), pose), 1, 1)
-    black, white = (trained[1].render(camera, pose, (c, c, c)) for c in (0.0, 1.0))
-    np.testing.assert_allclose(white.rgb - black.rgb, 1 - white.alpha[..., None].repeat(3, 2), atol=1e-5)
-
-
 def test_without_the_kernel_an_avatar_looks_the_same(trained, clip, monkeypatch):
     camera, pose = first_view(clip)
     camera = camera.resized(4, 5)

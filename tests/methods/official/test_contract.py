@@ -1,11 +1,8 @@
 """What all adapters have in common: what is checked before any work, given to a program, kept of it, and read back of its renders."""
 
-import json
-import os
 import shutil
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +14,7 @@ from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json
 from headbench.bench.process import ProgramError
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
-from headbench.methods.official import checkout, needs
+from headbench.methods.official import needs
 from headbench.methods.official.flashavatar import method as flashavatar
 from headbench.methods.official.gha.export import GHATracking
 from headbench.methods.official.insta import export as insta
@@ -80,17 +77,16 @@ class Killed(KeyboardInterrupt):
 
 @pytest.mark.parametrize("name", ["ga"])
 def test_a_training_that_ends_early_begins_anew(method, clip, behave, tmp_path):
-    """It crashes, leaves nothing, is killed or takes too long; the export is kept."""
+    """It crashes, is killed or takes too long; the export is kept."""
     frames = len(clip.splits["train"])
 
     def kill(done, total, note=""):
         if done >= frames + 5:
             raise Killed
 
-    for fault, expected in {"crash": "out of memory", "no output": "no whole avatar"}.items():
-        behave(fault)
-        with pytest.raises(ProgramError, match=expected):
-            fit(method, clip, tmp_path / "a")
+    behave("crash")
+    with pytest.raises(ProgramError, match="out of memory"):
+        fit(method, clip, tmp_path / "a")
     behave("hang")
     with pytest.raises(Killed):
         fit(method, clip, tmp_path / "a", kill)
@@ -105,11 +101,7 @@ def test_a_training_that_ends_early_begins_anew(method, clip, behave, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "fault", "expected"),
-    [
-        *((name, "no output", "no whole avatar") for name in ("gbs", "gha", "insta", "flashavatar")),
-        ("gha", "stop", "ended before its 5 iterations"),
-        ("gha", "crash", "out of memory"),
-    ],
+    [("insta", "no output", "no whole avatar"), ("gha", "stop", "ended before its 5 iterations")],
 )
 def test_a_training_that_fails_says_so(method, clip, behave, tmp_path, fault, expected):
     behave(fault)
@@ -193,11 +185,9 @@ def corner_of(name, clip, camera, pose):
 @every
 def test_frames_come_back_under_their_keys(name, avatar, clip, tmp_path, monkeypatch):
     for module in (rgbavatar, flashavatar, insta):  # more than one call for a camera's frames
-        monkeypatch.setattr(module, "PART", 4 if module is insta else 8)
-    wanted, before = (
-        views(clip, "novel_view", "self_reenactment", "train"),
-        avatar_digest(tmp_path / "avatar"),
-    )
+        monkeypatch.setattr(module, "PART", 5)
+    before, splits = avatar_digest(tmp_path / "avatar"), ("novel_view", "self_reenactment")
+    wanted = views(clip, *splits, *(() if name in OF_VIDEO else ("train",)))
     if name in (*OF_VIDEO, "insta"):
         odd, (camera, pose) = next(iter(wanted.items()))
         wanted[odd] = replace(camera, width=30), pose
@@ -227,15 +217,14 @@ MARK, CAMERA, SIZE = "the mark of frame", "rendered by the camera of another", "
 RENDERS = {
     "ga": {
         "crash in rendering": "exit code 1.*out of memory",
-        "other size": SIZE,
         "reversed": MARK,
         "one too few": "first 00001.png",
     },
-    "gbs": {"no coverage": "pred_mask_00000.png", "reversed": MARK},
+    "gbs": {"no coverage": "pred_mask_00000.png"},
     "gha": {"reversed": MARK},
-    "insta": {"no coverage": "colours and coverage", "reversed": CAMERA, "no cameras": "transforms_overlay"},
-    "rgbavatar": {"no coverage": "coverage", "one too few": "first 000001.png"},
-    "flashavatar": {"other size": SIZE, "reversed": MARK},
+    "insta": {"reversed": CAMERA, "no cameras": "transforms_overlay"},
+    "rgbavatar": {"no coverage": "coverage"},
+    "flashavatar": {"other size": SIZE},
 }
 
 
@@ -247,20 +236,12 @@ def test_renders_that_are_not_what_was_listed_are_found(avatar, clip, behave, na
             renders(avatar, clip)
 
 
-@pytest.mark.parametrize("name", ["ga"])
-def test_folders_may_be_relative(method, clip, avatar, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    method.config = replace(method.config, checkout=os.path.relpath(method.config.checkout))
-    assert renders(method.load(Path("avatar"), device="cpu"), clip)
-
-
 # ------------------------------------------------------------------ settings
 
 FAULTS = [
     *((name, {"device": "cpu-shim"}, "device") for name in ("gha", "insta")),
     *((name, {"order": "native"}, "order") for name in ("gha", "insta")),
     *((name, {"python": ""}, f"settings.{name}-official.python") for name in OF_VIDEO),
-    *((name, {"commit": "0" * 40}, "commit") for name in ADAPTERS),
     *((name, {"checkout": "/nowhere"}, "checkout.*git clone") for name in ADAPTERS),
     *(("insta", {"program": program}, "program") for program in ("build/none", "'unclosed", "/bin/true")),
 ]
@@ -295,7 +276,7 @@ def test_budgets_in_seconds_are_refused(method, clip, tmp_path):
     assert not (tmp_path / "a").exists()
 
 
-@every
+@pytest.mark.parametrize("name", ["ga", "insta"])
 def test_doctor_names_checkout_and_environment(method, monkeypatch, name):
     nothing = [*needs.official(type(method.config)(), "cpu")]
     assert [(need.what, need.found) for need in nothing] == [("checkout", ""), ("environment", "")]
@@ -305,18 +286,6 @@ def test_doctor_names_checkout_and_environment(method, monkeypatch, name):
     assert place.found.endswith(method.config.commit[:12])
     assert environment.found.startswith("instant-ngp 1.0dev" if name == "insta" else "Python 3")
     compile(needs.METHODS[type(method.config)].repository.trial, "trial", "exec")
-
-
-@pytest.mark.parametrize(("name", "remedy"), [("insta", "a CUDA device"), ("gha", "CUDA build of PyTorch")])
-def test_doctor_misses_a_gpu(method, monkeypatch, name, remedy):
-    monkeypatch.setattr(checkout, "_DEVICES", "print('headbench-devices', 0)")
-    monkeypatch.setitem(needs.METHODS, type(method.config), type(method))
-    if name != "insta":
-        probed = {"python": "3", "missing": {}, "failed": "", "torch": "2", "cuda": False}
-        monkeypatch.setattr(checkout, "_answer", lambda *_: (f"headbench-probe {json.dumps(probed)}", ""))
-    (_, environment) = needs.official(method.config, "cpu")
-    assert remedy in environment.remedy
-    assert "cpu-shim" not in environment.remedy, "the shim does not support this code"
 
 
 # ------------------------------------------------------------------ clips
@@ -388,10 +357,3 @@ def test_clips_that_their_code_cannot_take_are_refused(method, clip, case):
     change, expected = case
     with pytest.raises(InputError, match=expected):
         method.check(change(clip), BUDGET)
-
-
-@pytest.mark.parametrize("name", ["gbs"])
-def test_a_mask_that_is_missing_later_is_named(method, clip, tmp_path):
-    last = clip.splits["train"][-1]
-    with pytest.raises(InputError, match=f"{last}.*a mask"):
-        fit(method, replace(clip, masks=clip.masks | {last: None}), tmp_path / "a")

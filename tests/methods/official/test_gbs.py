@@ -4,7 +4,6 @@ import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -14,7 +13,6 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_pixels
 from headbench.datasets.images import write_image
 from headbench.methods.official.gbs.method import SHRINK
-from headbench.methods.official.video import six_numbers
 from headbench.methods.official.workplace import check_export
 
 from .helpers import export, pixels_of, world_points
@@ -109,12 +107,3 @@ def test_checkpoints_lose_their_optimiser_and_nothing_else(tmp_path, monkeypatch
     assert (degree, other, state, scale, iteration) == (3, {"kept": 1}, {}, 1.0, 40)
     assert isinstance(found, torch.nn.Parameter)
     assert torch.equal(found, before)
-
-
-def test_rotations_of_a_refitted_clip_may_be_read_only():
-    turns = np.array([0.3, -0.2, 0.1, 0.0, 0.0, np.pi / 2])
-    turns.flags.writeable = False
-    found = six_numbers(turns).reshape(2, 2, 3)
-    for rows, turn in zip(found, turns.reshape(2, 3)):
-        matrix, _ = cv2.Rodrigues(turn.copy())
-        np.testing.assert_allclose(rows, matrix[:2], atol=1e-12)

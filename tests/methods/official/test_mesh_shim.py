@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from headbench.methods.official.shim.meshes import SMALLEST_AREA, Mesh, load_obj, rasterize_meshes
-from headbench.methods.official.shim.unused import Node, PerceptualLoss, Silent
 from headbench.methods.shared.surface_points import texel_points
 
 SIZE = 24
@@ -101,16 +100,6 @@ def test_texels_of_a_chart_are_those_of_the_native_method():
         assert theirs_weights == pytest.approx(weights, abs=2e-4)  # vertices are float32
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"blur_radius": 0.1}, {"faces_per_pixel": 2}, {"perspective_correct": True}]
-)
-def test_what_it_does_not_draw_is_refused(wrong):
-    with pytest.raises(ValueError, match="expected one triangle"):
-        rasterize_meshes(mesh([[0.0, 0, 1]] * 3, [[0, 1, 2]]), image_size=4, **wrong)
-    with pytest.raises(ValueError, match="expected one mesh"):
-        Mesh(torch.zeros(2, 3, 3), torch.zeros(2, 1, 3))
-
-
 def test_objects_with_and_without_a_chart_are_read(tmp_path):
     path = tmp_path / "a.obj"
     path.write_text(
@@ -123,15 +112,3 @@ def test_objects_with_and_without_a_chart_are_read(tmp_path):
     assert extra.verts_uvs.tolist() == [[0.5, 0.25], [1, 0]]
     path.write_text("v 0 0 0\nf 1 1 1\n")
     assert load_obj(str(path))[2].verts_uvs is None
-
-
-def test_what_is_imported_and_not_used():
-    node = Node()
-    node.rate = 0.5
-    other = node.clone()
-    other.rate = 1.0
-    assert (node.rate, other.rate) == (0.5, 1.0)
-    assert Silent("log").info("nothing") is None
-    loss = PerceptualLoss(net="vgg").to("cpu")
-    with pytest.raises(NotImplementedError, match="no perceptual loss"):
-        loss(torch.zeros(1), torch.zeros(1))

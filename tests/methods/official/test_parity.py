@@ -76,9 +76,7 @@ def test_both_are_trained_and_their_difference_tabled(folder, capsys, monkeypatc
     ("words", "expected"),
     [
         ("ga --checkout nowhere", "--checkout"),
-        ("ga --checkout repository --python no-such-program --commit=", "--python"),
         ("ga --checkout repository --python ./python --commit= --data nowhere", "nowhere"),
-        ("ga --checkout repository --samples 300", "--samples"),
         ("flashavatar --checkout repository --iterations 15001", "at most 15000 with flashavatar"),
     ],
 )
@@ -133,18 +131,6 @@ def test_flashavatar_is_compared_as_tracked_without_a_neck(tmp_path):
     assert iterations.every(settings.sh_every, settings.min_sh_every) == 500
     config = run_config(ParitySettings("flashavatar", checkout="x", out="y", samples=300), tmp_path)
     assert {config.settings[name]["samples"] for name in config.methods} == {300}
-
-
-def test_rows_under_a_condition_are_compared():
-    rows = [
-        Row(
-            name, "1", 0, "novel_view", "s", "one", 0, "c", "full", "psnr", value, "hash", condition=condition
-        )
-        for condition, values in (("", (1.0, 2.0)), ("as-tracked", (20.0, 20.5)))
-        for name, value in zip(("native", "official"), values)
-    ]
-    (found,) = differences_of(Rows.of(rows), "native", "official", [0], "as-tracked")
-    assert (found.native, found.official) == ((20.0,), (20.5,))
 
 
 def test_differences_are_paired_by_subject_and_order():

@@ -59,11 +59,3 @@ def test_windows_are_the_largest_inside_and_least_around(cx, cy):
     padded = np.zeros((large.camera.height, large.camera.width, 3), np.uint8)
     padded[-large.top : 802 - large.top, -large.left : 550 - large.left] = image
     assert np.array_equal(large.uncut(padded, original), image)
-
-
-def test_a_centred_camera_is_left_as_it_is():
-    original = camera(275.0, 401.0)
-    for window in (inside(original), around(original)):
-        assert (window.left, window.top) == (0, 0)
-        assert np.array_equal(window.camera.world_to_camera, original.world_to_camera)
-        assert np.array_equal(window.camera.K, original.K)

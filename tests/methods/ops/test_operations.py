@@ -400,17 +400,6 @@ def test_degenerate_splats_and_triangles_have_finite_gradients() -> None:
 
 
 @needs_kernel
-@pytest.mark.parametrize("name", [name for name in CASES if name.startswith("plane colours")])
-def test_planes_have_the_same_gradients_where_splats_stay(name: str) -> None:
-    arguments = CASES[name].arguments(numbers(0), 77)
-    moving, still = (
-        run(CASES[name]._replace(differentiated=chosen), planes.plane_colors, arguments, torch.float32)
-        for chosen in ((0, 1, 3), (3,))
-    )
-    assert all(torch.equal(one, other) for one, other in zip(moving[3:], still[1:], strict=True))
-
-
-@needs_kernel
 @pytest.mark.parametrize(
     ("name", "place", "values"),
     [
@@ -447,9 +436,3 @@ def test_memory_for_results_that_does_not_fit_is_refused(out: Any) -> None:
     normal = numbers(0)
     with pytest.raises(ValueError, match="array 3 does not fit"):
         kernel.call("activate", normal(4, 3), normal(4, 4), out, torch.zeros(4, 4))
-
-
-@needs_kernel
-def test_missing_arguments_are_refused() -> None:
-    with pytest.raises(ValueError, match="missing"):
-        kernel.call("activate", numbers(0)(4, 3))

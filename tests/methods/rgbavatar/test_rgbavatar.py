@@ -372,16 +372,3 @@ def test_timed_steps_give_no_colours(clip, variant):
         training.close()
     assert found[0][0].any()
     torch.testing.assert_close(*found, rtol=0, atol=0)
-
-
-def test_inputs_that_the_head_model_lacks_alone_are_refused(clip):
-    without = replace(clip, head=replace(clip.head, eyelid_basis=None))
-    with pytest.raises(InputError, match=r"inputs: expected .* of the head model, found eyelids"):
-        make(without, inputs=("eyelids",))
-
-
-def test_a_batch_larger_than_the_capture_takes_all_its_images(clip):
-    training = make(clip, batch=100)
-    assert sorted(training._batches.batch(1)) == list(range(len(clip.splits["train"])))
-    assert torch.isfinite(training.loss(1, 0))
-    training.close()

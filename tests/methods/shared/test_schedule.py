@@ -134,13 +134,6 @@ def test_equal_places_give_equal_numbers_and_others_do_not():
     assert numpy_generator(0, "a").random() != numpy_generator(1, "a").random()
 
 
-def test_the_global_generator_is_left_alone():
-    torch.manual_seed(0)
-    before = torch.random.get_rng_state()
-    draw(0, "a", 0)
-    assert torch.equal(torch.random.get_rng_state(), before)
-
-
 @given(
     groups=st.lists(st.integers(0, 4), min_size=1, max_size=40),
     size=st.integers(1, 7),

@@ -115,18 +115,6 @@ def test_arrays_need_not_be_contiguous():
         assert torch.equal(a, b)
 
 
-def test_loss_of_alpha_alone_has_gradients():
-    scene = cloud(50, 20, 20, seed=31)
-
-    def gradient(dtype: torch.dtype, backend: str) -> torch.Tensor:
-        inputs = [value.to(dtype) for value in scene[:6]]
-        inputs[3] = scene.opacities.to(dtype, copy=True).requires_grad_()
-        alpha = rasterize(*inputs, scene.K, 20, 20, backend=backend).alpha
-        return torch.autograd.grad(alpha.sum(), inputs[3])[0]
-
-    assert relative_error(gradient(torch.float32, "cpu"), gradient(torch.float64, "reference")) < 1e-3
-
-
 def test_renders_in_a_forked_child():
     scene = head_shell(2000, 64, 64)
     before = rasterize(*scene[:9], backend="cpu", threads=3).image
@@ -258,14 +246,3 @@ def test_sharp_splats_far_from_the_corner_keep_their_place(kernel, wide):
     accuracy = compare_with(truth, scene, kernel)
     assert accuracy.image_max < 3e-6
     assert max(accuracy.gradients.values()) < 1e-5
-
-
-def test_frames_of_other_scenes_in_between_change_nothing():
-    scene = head_shell(1500, 70, 60)
-    first = render_with_gradients(scene, torch.float32, backend="cpu")
-    for seed in range(4):
-        render_with_gradients(cloud(900, 90, 80, seed=seed, channels=seed + 1), torch.float32, backend="cpu")
-    again = render_with_gradients(scene, torch.float32, backend="cpu")
-    assert torch.equal(first.rendering.image, again.rendering.image)
-    for name, gradient in first.gradients.items():
-        assert torch.equal(gradient, again.gradients[name]), name

@@ -8,7 +8,6 @@ import pytest
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.methods.trivial.method import INDEX_FILE, MEAN_FILE, MeanImage, NearestCamera, resize
-from headbench.methods.trivial.spec import NearestCameraConfig
 
 
 def fit(method, clip, folder):
@@ -74,24 +73,11 @@ def test_a_pose_of_another_head_model_is_refused(method, clip, tmp_path):
         fit(method(), clip, tmp_path).render(clip.cameras["00"], replace(clip.poses[0], head_model="another"))
 
 
-def test_storage_can_be_bounded(clip, tmp_path):
-    avatar = fit(NearestCamera(NearestCameraConfig(max_timesteps=1)), clip, tmp_path)
-    cameras = {key.camera for key in clip.splits["train"]}
-    assert len(avatar.files()) == 1 + len(cameras)
-    assert len(list((tmp_path / "images").iterdir())) == len(cameras)
-
-
 def test_resize_keeps_means_and_leaves_its_own_size_alone():
     image = np.random.default_rng(0).random((12, 8, 4)).astype(np.float32)
     assert resize(image, 8, 12) is image
     np.testing.assert_allclose(resize(image, 4, 6), image.reshape(6, 2, 4, 2, 4).mean((1, 3)), atol=1e-6)
     assert resize(image, 16, 24).shape == (24, 16, 4)
-
-
-def test_cameras_of_other_sizes_are_met_by_resizing(clip, tmp_path):
-    avatar = fit(MeanImage(), clip, tmp_path)
-    camera = replace(clip.cameras["00"], width=14, height=18)
-    assert avatar.render(camera, clip.poses[0]).rgb.shape == (18, 14, 3)
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,8 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.refit import refit as block
 from headbench.datasets.head.refit.command import refit_capture, target_head
-from headbench.datasets.head.refit.rewrite import capture_plan, link_or_copy, write_capture
+from headbench.datasets.head.refit.rewrite import capture_plan, write_capture
 from headbench.datasets.head.refit.settings import RefitCommandSettings
-from headbench.datasets.steps.masks import set_background
 
 from ...tiny_capture import edit_json, make_plan, write_tiny_capture
 
@@ -161,21 +160,3 @@ def test_timesteps_with_gaps_are_numbered_anew(finished, tmp_path):
     for new, old in zip(sorted(written.files), sorted(files), strict=True):
         assert (new.sequence, new.camera) == (old.sequence, old.camera)
         np.testing.assert_array_equal(written.image(new), clip.image(old))
-
-
-def test_images_that_a_step_changed_are_written_as_they_are_now(finished, tmp_path):
-    _, settings, _ = finished
-    clip = set_background(read_capture(settings.capture), (0.0, 0.0, 0.0))
-    written = read_capture(write_capture(clip, tmp_path))
-    assert not written.pixel_steps
-    for key in sorted(clip.files):
-        np.testing.assert_array_equal(written.image(key), clip.image(key))
-
-
-def test_files_are_copied_where_they_cannot_be_linked(tmp_path, monkeypatch):
-    source, target = tmp_path / "a.png", tmp_path / "b" / "c.png"
-    source.write_bytes(b"content")
-    monkeypatch.setattr(os, "link", lambda *_: (source / "a file is no folder").touch())
-    link_or_copy(source, target)
-    assert target.read_bytes() == b"content"
-    assert [*target.parent.iterdir()] == [target]

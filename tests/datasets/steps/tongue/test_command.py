@@ -1,7 +1,5 @@
 """The command on a painted capture, and its file as a setting of the reader."""
 
-import json
-import shutil
 from dataclasses import replace
 
 import cv2
@@ -86,28 +84,6 @@ def test_decisions_overrides_and_exclusion(capture, tmp_path):
     assert clip.steps[-1].name == "exclude_timesteps"
     protocol = make_protocol("self_reenactment", [clip])
     assert {key.timestep: reason for key, reason in protocol.excluded}[6].startswith("tongue out")
-
-
-def test_people_may_leave_out_what_no_chosen_camera_recorded(capture, tmp_path):
-    """The camera that the mouth faces most has no frame of timestep 3, which somebody left out."""
-    copy = tmp_path / "captures"
-    shutil.copytree(capture.parent, copy)
-    union = copy / capture.name
-    for path in union.glob("transforms_*.json"):
-        document = json.loads(path.read_text())
-        document["frames"] = [
-            f for f in document["frames"] if (f["timestep_index"], f["camera_id"]) != (3, "at0")
-        ]
-        path.write_text(json.dumps(document))
-    out = tmp_path / "out"
-    look(union, out, cameras=1)
-    path = out / DECISIONS_FILE
-    decided = read_exclusions(path)["900"]
-    assert (decided.cameras, 3 in decided.frames) == (("at0",), False)
-    write_exclusions(path, {"900": replace(decided, overrides={3: "blink"})})
-    findings = look(union, out, cameras=1)
-    assert "in no camera: 3" in findings.text
-    assert "3" in findings.data["900"]["excluded"]
 
 
 def test_given_threshold_is_used_and_bad_input_is_refused(capture, tmp_path):

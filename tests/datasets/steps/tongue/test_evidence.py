@@ -87,10 +87,6 @@ def test_threshold_lies_in_the_widest_gap_between_its_bounds(areas):
     assert max(around) == pytest.approx(widest, abs=0.01)
 
 
-def test_a_clear_gap_is_taken():
-    assert choose_threshold(np.array([0, 22, 24, 55, 58, 200]))[0] == pytest.approx(np.sqrt(24 * 55), abs=0.1)
-
-
 def test_reasons():
     decided = decide(
         {10: "A", 11: "A", 12: "B", 13: "B"},

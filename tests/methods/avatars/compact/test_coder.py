@@ -87,16 +87,6 @@ def test_the_transform_removes_what_is_common_to_columns():
     assert pack(encoder.arrays["x"])[0].size < pack(alone)[0].size / 4
 
 
-def test_units_repeat_along_the_columns():
-    values = np.random.default_rng(0).normal(size=(400, 6)) * [1, 100, 1, 100, 1, 100]
-    units = np.tile([[1.0, 100.0]], (400, 1))
-    found, _ = both(values, lambda coder: coder.vectors("x", "colors", 0.1, units=units))
-    error = np.sqrt(np.mean((found - values) ** 2, axis=0))
-    assert np.all(error[::2] < 0.08)
-    assert np.all(error[1::2] < 8)
-    assert np.all(error[1::2] > 1)
-
-
 def test_an_error_is_half_as_visible_in_the_next_class():
     weights = 4.0 ** -np.arange(8)
     classes = visibility_classes(weights, 8)
@@ -114,10 +104,3 @@ def test_steps_outside_their_range_are_refused():
     for value in (0.0, -1.0, 1e9, float("nan")):
         with pytest.raises(ValueError, match="step"):
             Precision(step=value)
-
-
-def test_one_factor_changes_all_steps():
-    half = Precision(step=0.5).scaled
-    assert half.step == 1
-    assert half.parts == {part: 0.5 * step for part, step in Precision().parts.items()}
-    assert not any(EXACT.scaled.parts.values())

@@ -87,10 +87,3 @@ def test_reduced_tensors_come_back_within_their_rounding(tmp_path, kind, bytes_e
     assert ((read["values"] - values).abs() <= bound).all()
     assert (read["values"] != values).any()
     assert path.stat().st_size < values.numel() * bytes_each + 4 * 70_000 + 2_000
-
-
-@given(st.floats(-1e6, 1e6, width=32), st.integers(1, 5))
-def test_a_constant_column_is_kept_exactly_in_eight_bits(tmp_path_factory, value, rows):
-    path = tmp_path_factory.mktemp("reduced") / "x.safetensors"
-    write_reduced(path, {"v": torch.full((rows, 2), value)}, "8bit")
-    assert torch.equal(read_reduced(path)["v"], torch.full((rows, 2), value))
