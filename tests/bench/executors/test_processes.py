@@ -152,7 +152,7 @@ def test_with_the_parent_killed_workers_end(config, command, tmp_path, rows_of, 
     worker = read_outcome(cell)["process"]
     capsys.readouterr()
     assert cli.main(["status", config.out]) == 0
-    assert "1 cells: 0 waiting, 1 running, 0 done, 0 failed" in capsys.readouterr().out
+    assert "1 cell: 0 waiting, 1 running, 0 done, 0 failed" in capsys.readouterr().out
     first.kill()
     wait_for(lambda: not psutil.pid_exists(worker) and not is_locked(cell))
     assert cli.main(["status", config.out]) == 0
