@@ -29,9 +29,8 @@ from .axe import serious_findings
 
 # How long an example takes says something of the machine's load, nothing of the code. The examples are the same in every
 # run, so that a red run is the change's doing; `make nightly` looks for new ones among damaged files.
-settings.register_profile(
-    "repeatable", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
-)
+how = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow], "derandomize": True}
+settings.register_profile("repeatable", max_examples=50, **how)
 settings.load_profile("repeatable")
 
 

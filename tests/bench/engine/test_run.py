@@ -524,7 +524,7 @@ def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
 
 
 REPLACED = ("run.json", "rows.parquet", "contact_sheet.png", "report.html", "tables")
-REFUSED = ("protocols", "subject1", "subject1/toy/seed-0/avatar/level.txt", "subject1/toy/seed-0/renders")
+REFUSED = ("protocols", "subject1/toy/seed-0/avatar/level.txt", "subject1/toy/seed-0/renders")
 
 
 @pytest.mark.parametrize(("places", "expected"), [(REPLACED, 0), *(((place,), 2) for place in REFUSED)])

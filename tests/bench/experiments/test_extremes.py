@@ -87,6 +87,7 @@ def test_a_stable_avatar_passes_and_what_has_no_truth_is_missing(ball_run):
     assert not (folder / "extremes" / "truth").exists()
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_avatars_that_render_lists_alone_are_missing(ball_run):
     folder = ball_run("LISTED")
     found = extremes_run(settings(folder))
@@ -98,6 +99,7 @@ def test_avatars_that_render_lists_alone_are_missing(ball_run):
     assert set(missing["metric"]) == {metric.name for metric in (*STABILITY, *AGAINST_TRUTH)}
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_a_burst_where_jaw_and_expression_act_together_is_found(ball_run, balls, tmp_path):
     folder = ball_run("BURSTING", "BALL")
     found = extremes_run(settings(folder))
@@ -143,6 +145,7 @@ def test_splats_that_grow_and_values_not_finite_are_found(ball_run, balls, tmp_p
     assert "typical_turntable-00.png" in written
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_what_is_not_there_is_refused_before_any_work(ball_run, run_of, tmp_path):
     folder, floor = ball_run("BALL", "FLOOR"), run_of("ball_plugin:FLOOR", folder=tmp_path / "floor")
     (tmp_path / "moved" / "ball-other").mkdir(parents=True)
