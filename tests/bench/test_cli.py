@@ -58,15 +58,12 @@ def test_help_and_version_are_found_by_their_usual_words(capsys):
         ("run --data . --out out --set iteratoins=3", "Did you mean settings.METHOD.budget.iterations?"),
         ("run --data . --out out --set sedes=3", "Did you mean 'seeds'"),
         ("run --config run.yaml", "run.yaml, metods: expected one of"),
-        ("run --out x", "--data"),
         ("table .", "run.json"),
         ("demo --out out --set methods=gaa", "Did you mean 'ga'"),
         ("demo --out out --set capture=3", "a group of settings"),
         ("demo --out out --set device=gpu7", "device"),
-        ("demo --out run.yaml/out", "can be written"),
         ("demo --out a\0b", "can be written"),
         ("synth --out out --size 5x5", "WIDTHxHEIGHT"),
-        ("run --data . --out out --seeds one", "seeds"),
     ],
 )
 def test_bad_input_is_refused_before_work(capsys, tmp_path, monkeypatch, words, found):

@@ -125,10 +125,7 @@ def test_every_paper_has_the_schema_and_known_methods():
 
 
 CHANGES = [
-    (lambda p: p.update(titel="x"), "titel: expected one of .*Did you mean 'title'"),
-    (lambda p: p.pop("venue"), "venue: expected a value, found nothing"),
     (lambda p: p.update(arxiv="25.1"), "arxiv: a number such as 2504.14967"),
-    (lambda p: p["tables"][0].update(grade="D"), r"tables\[0\]\.grade"),
     (lambda p: p["tables"][0].update(rows=[]), "rows: at least one, each name once; found none"),
     (lambda p: p["tables"][0]["rows"][0].update(values={}), "values: at least one; found none"),
     (lambda p: p["tables"][0]["rows"][0]["values"].update(psnr="3"), "values: TASK/METRIC of .*; found psnr"),

@@ -46,7 +46,7 @@ def test_the_plot_says_what_is_held_out(monkeypatch, tmp_path, tasks, says):
     assert says in notes[0]
 
 
-def test_a_plot_has_the_markers_of_each_method_and_says_what_is_missing(tmp_path):
+def test_a_plot_has_each_method_and_no_line_where_none_is(tmp_path):
     lines = {"a": [(1.0, 20.0, 0.0), (4.0, 22.0, 0.5)], "b": [(2.0, 21.0, 0.0)]}
     panels = [CurvePanel("PSNR", lines, ""), CurvePanel("LPIPS", {}, "no weights")]
     write_plot(tmp_path / "curve.png", [panels], "Seconds", "A note.")
