@@ -3,6 +3,7 @@
 import ast
 import re
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -19,32 +20,43 @@ MAY_IMPORT = {
 FORBIDDEN_PACKAGES = {"reports": {"torch"}, "bench": {"torch"}}
 NOWHERE = {"torchvision", "pickle5", "chumpy"}
 SOURCES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
-parsed = cache(ast.parse)
 
 
-def imports(path: Path, tree: ast.AST, *, members: bool = False) -> list[str]:
+@cache
+def import_nodes(source: str) -> list[ast.Import | ast.ImportFrom]:
+    """Every import of a source, also those in functions."""
+    return [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
+def imports(path: Path, source: str, *, members: bool = False) -> list[str]:
     """Absolute dotted names of everything a source imports, ``headbench.`` in front for our own.
 
     With ``members`` also the names after ``from ... import``, which may be modules.
     """
     package = ["headbench", *path.relative_to(ROOT).parent.parts]
     names: list[str] = []
-    for node in ast.walk(tree):
+    for node in import_nodes(source):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else []
-            stem = ".".join([*base, *([node.module] if node.module else [])])
-            names += [stem] if node.module else []
-            names += [f"{stem}.{alias.name}" for alias in node.names] if members or not node.module else []
+            continue
+        base = package[: len(package) - node.level + 1] if node.level else []
+        stem = ".".join([*base, *([node.module] if node.module else [])])
+        names += [stem] if node.module else []
+        names += [f"{stem}.{alias.name}" for alias in node.names] if members or not node.module else []
     return names
+
+
+@cache
+def texts() -> dict[str, str]:
+    """The text of every source, by its path in the repository."""
+    return {path.relative_to(ROOT).as_posix(): path.read_text() for path in SOURCES}
 
 
 def violations(path: Path, source: str) -> list[str]:
     """What a source of a package imports against the rules."""
     package = path.relative_to(ROOT).parts[0]
     found = []
-    for name in imports(path, parsed(source)):
+    for name in imports(path, source):
         parts = name.split(".")
         if parts[0] == "headbench":
             other = parts[1] if len(parts) > 1 else ""
@@ -55,35 +67,22 @@ def violations(path: Path, source: str) -> list[str]:
     return found
 
 
-MODULES = {".".join(("headbench", *path.relative_to(ROOT).with_suffix("").parts)): path for path in SOURCES}
-
-
-def circles(sources: dict[str, str]) -> list[set[str]]:
-    """Groups of modules that import each other, directly or through others; imports in functions and for types count."""
-    known = {name.removeprefix("headbench."): source for name, source in sources.items()}
-    edges: dict[str, set[str]] = {}
-    for name, source in known.items():
-        path = ROOT / (name.replace(".", "/") + ".py")
-        wanted = (one.removeprefix("headbench.") for one in imports(path, parsed(source), members=True))
-        edges[name] = {one for one in wanted if one in known and one != name}
-    reached = {name: set(edges[name]) for name in edges}
-    changed = True
-    while changed:
-        changed = False
-        for name, found in reached.items():
-            more = found.union(*(reached[other] for other in found))
-            changed |= len(more) > len(found)
-            reached[name] = more
-    groups: list[set[str]] = []
-    for name, found in reached.items():
-        if name in found and not any(name in group for group in groups):
-            groups.append({other for other in found if name in reached[other]})
-    return groups
+def circle(sources: dict[str, str]) -> set[str]:
+    """Modules that import each other, directly or through others; imports in functions and for types count."""
+    edges = {}
+    for name, source in sources.items():
+        path = ROOT / (name.removeprefix("headbench.").replace(".", "/") + ".py")
+        edges[name] = {one for one in imports(path, source, members=True) if one in sources and one != name}
+    try:
+        TopologicalSorter(edges).prepare()
+    except CycleError as error:
+        return set(error.args[1])
+    return set()
 
 
 def test_modules_do_not_import_each_other_in_circles():
-    sources = {name: path.read_text() for name, path in MODULES.items()}
-    assert circles(sources) == []
+    dotted = {f"headbench.{name[:-3].replace('/', '.')}": text for name, text in texts().items()}
+    assert circle(dotted) == set()
 
 
 @pytest.mark.parametrize(
@@ -97,17 +96,18 @@ def test_modules_do_not_import_each_other_in_circles():
 )
 def test_a_circle_is_found(back):
     sources = {
-        "bench.x.command": "from .work import f",
-        "bench.x.work": back,
-        "bench.y": "from .x import work",
+        "headbench.bench.x.command": "from .work import f",
+        "headbench.bench.x.work": back,
+        "headbench.bench.x.between": "from .command import Settings",
+        "headbench.bench.y": "from .x import work",
     }
-    sources["bench.x.between"] = "from .command import Settings"
-    found = {"bench.x.command", "bench.x.work"} | ({"bench.x.between"} if "between" in back else set())
-    assert circles({f"headbench.{name}": source for name, source in sources.items()}) == [found]
+    assert circle(sources) == set(sources) - {"headbench.bench.y"} - (
+        set() if "between" in back else {"headbench.bench.x.between"}
+    )
 
 
 def test_packages_import_only_what_stands_below_them():
-    assert [(path, found) for path in SOURCES for found in violations(path, path.read_text())] == []
+    assert [(name, found) for name, text in texts().items() for found in violations(ROOT / name, text)] == []
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_contracts_need_numpy_and_the_standard_library_only(name):
     import sys
 
     path = ROOT / "bench" / name
-    roots = {name.split(".")[0] for name in imports(path, parsed(path.read_text()))}
+    roots = {name.split(".")[0] for name in imports(path, path.read_text())}
     assert roots <= {"numpy"} | set(sys.stdlib_module_names)
 
 
@@ -166,20 +166,14 @@ BANNED = {
 
 def test_rows_are_read_through_their_query_alone():
     pattern = re.compile(r"\._table\b|\bread_parquet\(")
-    users = {path.relative_to(ROOT).as_posix() for path in SOURCES if pattern.search(path.read_text())}
+    users = {name for name, text in texts().items() if pattern.search(text)}
     assert {name for name in users if name.startswith(("bench", "reports"))} == {"bench/rows.py"}
 
 
 @pytest.mark.parametrize("what", BANNED)
 def test_no_code_contains(what):
-    pattern = re.compile(BANNED[what])
-    hits = [
-        f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
-        for path in SOURCES
-        for number, line in enumerate(path.read_text().splitlines(), 1)
-        if pattern.search(line)
-    ]
-    assert hits == []
+    found = [(name, hit) for name, text in texts().items() for hit in re.finditer(BANNED[what], text)]
+    assert [f"{name}:{hit.string.count(chr(10), 0, hit.start()) + 1}: {hit[0]}" for name, hit in found] == []
 
 
 READ_IN_ONE_PLACE = {
@@ -216,22 +210,14 @@ READ_IN_ONE_PLACE = {
 
 @pytest.mark.parametrize("pattern", READ_IN_ONE_PLACE)
 def test_binary_files_are_read_in_one_place(pattern):
-    users = {path.relative_to(ROOT).as_posix() for path in SOURCES if re.search(pattern, path.read_text())}
+    users = {name for name, text in texts().items() if re.search(pattern, text)}
     assert users <= READ_IN_ONE_PLACE[pattern]
 
 
-IMPORTED_IN_FUNCTIONS = {"nlopt", "pycolmap", "pymeshlab"}
-"""Packages that only few commands use, each slow to import; not by any module, but by the functions that use them."""
-
-
 def test_packages_of_few_uses_are_imported_in_functions():
-    found = []
-    for path in SOURCES:
-        at_import = [node for node in parsed(path.read_text()).body if not isinstance(node, ast.FunctionDef)]
-        at_import = [node for node in at_import if not isinstance(node, ast.ClassDef)]
-        names = imports(path, ast.Module(at_import, []))
-        found += [f"{path}: {name}" for name in names if name.split(".")[0] in IMPORTED_IN_FUNCTIONS]
-    assert found == []
+    """Each is slow to import and used by few commands."""
+    slow = re.compile(r"^(?:import|from) (?:nlopt|pycolmap|pymeshlab)\b", re.MULTILINE)
+    assert [name for name, text in texts().items() if slow.search(text)] == []
 
 
 ENTRIES = re.compile(r"^( *)(?:Parameters|Attributes)\n\1-+\n((?:\1 *(?!\"\"\")\S.*\n)+)", re.MULTILINE)
@@ -247,11 +233,8 @@ def malformed_entries(source: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_entries_of_docstrings_name_types(package):
-    paths = {path.relative_to(ROOT).as_posix(): path for path in SOURCES}
-    wanted = [name for name in paths if name.startswith(package)]
-    assert [(name, line) for name in wanted for line in malformed_entries(paths[name].read_text())] == []
+def test_entries_of_docstrings_name_types():
+    assert [(name, line) for name, text in texts().items() for line in malformed_entries(text)] == []
 
 
 @pytest.mark.parametrize(
@@ -269,23 +252,17 @@ def test_malformed_entries_are_found(entry, malformed):
 
 
 def test_names_of_tests_have_at_most_60_characters():
-    sources = {path: path.read_text() for path in sorted((ROOT / "tests").rglob("*.py"))}
-    names = [
-        (path.name, name) for path, text in sources.items() for name in re.findall(r"def (test_\w+)", text)
-    ]
-    assert len(names) > 1_000
-    assert [(path, name) for path, name in names if len(name) > 60] == []
-    seen: dict[tuple[Path, str], int] = {}
-    for path, text in sources.items():
-        for name in re.findall(r"^def (test_\w+)", text, re.MULTILINE):
-            seen[path, name] = seen.get((path, name), 0) + 1
-    assert [key for key, count in seen.items() if count > 1] == []
+    tests = {path: path.read_text() for path in (ROOT / "tests").rglob("*.py")}
+    names = {path: re.findall(r"^def (test_\w+)", text, re.MULTILINE) for path, text in tests.items()}
+    assert sum(map(len, names.values())) > 1_000
+    assert [(path, name) for path, found in names.items() for name in found if len(name) > 60] == []
+    assert [path for path, found in names.items() if len(set(found)) < len(found)] == []
 
 
 def test_public_classes_have_names_of_their_own():
     homes: dict[str, list[str]] = {}
-    for path in SOURCES:
-        for name in re.findall(r"^class ([A-Z]\w*)", path.read_text(), re.MULTILINE):
-            homes.setdefault(name, []).append(str(path))
+    for path, text in texts().items():
+        for name in re.findall(r"^class ([A-Z]\w*)", text, re.MULTILINE):
+            homes.setdefault(name, []).append(path)
     assert len(homes) > 500
     assert {name: paths for name, paths in homes.items() if len(paths) > 1} == {}

@@ -131,11 +131,6 @@ def test_the_manifest_lets_one_repeat_it(run):
         assert not set(protocol.keys) & {key for key, _ in protocol.excluded}
 
 
-def test_the_result_is_there_for_machines(demo):
-    means = json.loads(demo[1])["means"]
-    assert {entry["method"] for entry in means} == METHODS
-
-
 @pytest.mark.slow
 def test_killed_at_random_moments_it_ends_with_the_same_numbers(tmp_path):
     """Processes of their own, whose capture is ray-traced."""

@@ -52,29 +52,6 @@ def test_the_readme_is_short():
     assert README.count("\n") <= 155
 
 
-def test_the_ci_example_installs_from_checkouts():
-    page = (ROOT / "docs" / "howto" / "ci.md").read_text(encoding="utf-8")
-    block = re.search(r"```yaml\n(# \.github/workflows.*?)```", page, re.DOTALL)
-    steps = yaml.safe_load(block[1])["jobs"]["quality"]["steps"]
-    checked_out = {
-        step.get("with", {}).get("path", ".") for step in steps if "checkout" in step.get("uses", "")
-    }
-    installs = [
-        line.split() for step in steps for line in step.get("run", "").splitlines() if "pip install" in line
-    ]
-    assert len(installs) == 2
-    for words in installs:
-        for source in words[2:]:
-            place = source.removeprefix("./")
-            assert (
-                source.startswith("-")
-                or place in checked_out
-                or (ROOT / place.removeprefix("headbench/")).is_file()
-            )
-    used = {step["run"].split()[1] for step in steps if step.get("run", "").startswith("headbench ")}
-    assert used <= set(discover("commands"))
-
-
 def test_a_release_names_its_address_and_has_absolute_links(tmp_path):
     subprocess.run(
         ["make", "-s", "release-source", f"RELEASE={tmp_path}/r", "URL=https://example.org/me/headbench"],
@@ -94,15 +71,6 @@ def test_the_citation_has_the_version_of_the_package():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert {"cff-version", "message", "title", "authors"} <= set(citation)
     assert (citation["version"], citation["license"]) == (project["version"], project["license"])
-
-
-def test_the_title_of_the_citation_is_that_of_the_package():
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    name, _, what = citation["title"].partition(": ")
-    assert name == project["name"]
-    assert project["description"].lower().startswith(what.lower())
-    assert f"## [{project['version']}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
@@ -126,13 +94,6 @@ def test_workflows_call_what_exists_and_hold_no_rights(path):
             assert (
                 "${{" not in script or "github.repository" in script
             )  # what others write is no part of a script
-
-
-@pytest.mark.parametrize("name", ["bug.yml", "proposal.yml"])
-def test_issue_forms_have_what_forms_need(name):
-    form = yaml.safe_load((ROOT / ".github" / "ISSUE_TEMPLATE" / name).read_text(encoding="utf-8"))
-    assert {"name", "description", "body"} <= set(form)
-    assert all(field["attributes"]["label"] for field in form["body"])
 
 
 def test_the_hook_checks_what_make_check_does():
@@ -165,17 +126,6 @@ def test_the_container_copies_every_package_and_no_more():
     }
     assert copied == set(packages.values()) | files
     assert all((ROOT / name).exists() for name in copied)
-
-
-def test_make_targets_exist():
-    targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    assert set(re.findall(r"make (demo|test|setup|check|bench)\b", README)) <= targets
-    assert {"setup", "demo", "test", "check", "bench"} <= targets
-
-
-def test_ci_runs_the_test_command_of_the_readme():
-    assert "make test" in README
-    assert "make test" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")

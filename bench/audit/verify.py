@@ -23,6 +23,7 @@ from ..engine.store import Cell, RunFolder
 from ..errors import ExitCode, InputError
 from ..io.images import read_png
 from ..manifest import ProtocolRecord
+from ..progress import counted
 from ..protocol import make_protocols
 from ..rows import ALL, FRAME, Rows
 from ..specs import CommandResult, MetricSpec
@@ -60,8 +61,10 @@ class Findings:
 
     def text(self, name: str) -> str:
         """The findings in words."""
-        count, compared = len(self.mismatches), f"{self.files} files and {self.values} values"
-        verdict = f"{count} mismatches: {compared} compared" if count else f"{compared} as recorded"
+        count = len(self.mismatches)
+        compared = f"{counted(self.files, 'file')} and {counted(self.values, 'value')}"
+        wrong = "1 mismatch" if count == 1 else f"{count} mismatches"
+        verdict = f"{wrong}: {compared} compared" if count else f"{compared} as recorded"
         lines = [f"{name}: {verdict}.", *(f"  {mismatch}" for mismatch in self.mismatches[:SHOWN])]
         lines += [f"  and {count - SHOWN} more"] if count > SHOWN else []
         reasons: dict[str, list[str]] = {}

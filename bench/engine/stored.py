@@ -196,8 +196,10 @@ def open_avatar(folder: Path, method: str = "") -> StoredAvatar:
     record: AvatarRecord = checked(read_json(path), AvatarRecord, path)
     check_numbers(path, "shape", np.asarray(record["shape"]), MAX_MAGNITUDE)
     if record["made_by"] == "variant":
-        remedy = f"Load the trained avatar of {record['method']}, which it was derived from."
-        raise InputError(path, "made_by", "an avatar that its method reads", "a variant of a sweep", remedy)
+        remedy = f"Load the trained avatar of {record['method']}, which it was derived from, or what "
+        remedy += "`headbench export compact` makes of that."
+        derived = "a variant, as `headbench run sweep` and the condition `coded` derive it"
+        raise InputError(path, "made_by", "an avatar that its method reads", derived, remedy)
     name = method or record["method"]
     if not method and name not in discover("methods"):
         remedy = "Install the package that registers it, or name it: --method package.module:SPEC, in Python method='package.module:SPEC'."

@@ -16,7 +16,7 @@ from ..engine.store import RunFolder
 from ..errors import HeadbenchError
 from ..io.lock import is_locked
 from ..manifest import Manifest
-from ..progress import duration
+from ..progress import counted, duration
 from ..rows import ALL
 from ..specs import CommandResult
 from .outcome import TaskOutcome, read_outcome
@@ -64,7 +64,9 @@ def run_status(run: Path) -> CommandResult:
     cells = cell_states(folder, folder.read_manifest())
     counts = Counter(cell.state for cell in cells)
     left, bound = time_left(cells)
-    text = f"{run}: {len(cells)} cells: {', '.join(f'{counts[state]} {state}' for state in STATES)}"
+    text = (
+        f"{run}: {counted(len(cells), 'cell')}: {', '.join(f'{counts[state]} {state}' for state in STATES)}"
+    )
     speed = sum(cell.note == SPEED for cell in cells)
     if speed:
         text += f"; {speed} of those waiting lack only their speed, which is measured last"

@@ -22,11 +22,9 @@ def test_every_protocol_names_its_profile_and_source():
 
 CHANGES = [
     ({"mask": "face"}, "mask: expected one of"),
-    ({"tasks": {}}, "tasks: at least one; found none"),
     ({"tasks": {"drive": {}}}, "tasks: novel_view or self_reenactment; found drive"),
     ({"tasks": {"novel_view": {"cameras": "new"}}}, "cameras: expected one of .*, found 'new'"),
     ({"tasks": {"novel_view": {"last": 0}}}, "last: at least 1, or null for all; found 0"),
-    ({"pooled": 0}, "pooled: at least 1, or null; found 0"),
 ]
 
 

@@ -98,19 +98,6 @@ def test_a_step_of_another_device_does_not_count(monkeypatch, tmp_path):
     assert [bar.holds for bar in script.kept(1, "cuda", tmp_path)] == [False]
 
 
-def test_wheels_are_collected_with_what_builds_headbench(monkeypatch, tmp_path, capsys):
-    calls = []
-
-    def run(command, **options):
-        calls.append(command)
-        return types.SimpleNamespace(returncode=0)
-
-    monkeypatch.setattr(script.subprocess, "run", run)
-    assert script.main(["--wheels", str(tmp_path)]) == 0
-    assert {"requirements-torch-cuda.txt", "requirements.txt", str(tmp_path)} <= set(calls[0])
-    assert f"--no-index --find-links {tmp_path}" in capsys.readouterr().out
-
-
 def test_the_rasteriser_keeps_its_bounds_on_the_cpu(tmp_path):
     bars = steps.rasteriser("cpu", tmp_path)
     assert len(bars) == 6

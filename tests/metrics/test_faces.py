@@ -134,28 +134,6 @@ def test_without_its_file_the_remedy_says_where_it_is(
     assert next(iter(needs(None, "cpu"))).found == ""
 
 
-@pytest.mark.parametrize("metric", [AkdPipNet, CsimArcFace])
-def test_without_dlib_no_file_of_a_network_is_read(monkeypatch, metric):
-    monkeypatch.setitem(sys.modules, "dlib", None)
-    for module, name in ((akd, "_pipnet"), (csim, "_arcface")):
-        monkeypatch.setattr(module, name, lambda: pytest.fail("read"))
-    with pytest.raises(UnavailableError, match="package dlib is not installed"):
-        metric()(level(1), level(1))
-
-
-@pytest.mark.parametrize(
-    ("name", "found"), [(".", "a folder"), (4096 * "x", "not there")], ids=["folder", "long"]
-)
-def test_a_variable_that_names_no_file_is_refused(monkeypatch, tmp_path, name, found):
-    monkeypatch.setenv("HEADBENCH_X", str(tmp_path / name))
-    network = lambda: faces.named_file("X", "HEADBENCH_X", "remedy")
-    with pytest.raises(InputError, match=f"HEADBENCH_X: expected a file, found .*, {found}. remedy"):
-        network()
-    need = faces.network_need("x", "HEADBENCH_X", "remedy", network)
-    assert (need.found, need.required) == ("", False)
-    assert f", {found}" in need.remedy
-
-
 def test_the_file_of_a_network_that_can_be_read_is_found(monkeypatch):
     monkeypatch.setenv("HEADBENCH_X", "there")
     assert faces.network_need("x", "HEADBENCH_X", "remedy", lambda: None).found == "there"

@@ -78,7 +78,6 @@ def test_maps_of_known_landmarks_are_decoded():
             (65, 35),
         ),  # 5 columns more on both sides; 3 rows from the top to the bottom
         ((60, 40, 50, 30), (56, 42), (58, 30)),  # in the authors' arithmetic 0.1 of 50 is less than 5
-        ((-8, -20, 55, 65), (0, 0), (52, 51)),
         ((170, 100, 65, 55), (164, 105), (36, 15)),
     ],
 )
@@ -129,10 +128,8 @@ def test_weights_are_those_of_the_file_and_no_other_network_s(finder, network, t
     [
         (None, "no such file"),
         ("0.5 " * 195, "195"),
-        ("0.5 " * 195 + "x", "could not convert"),
         ("0.5 " * 195 + "nan", "1 that are NaN"),
         ("0.5 " * 195 + "47", "47"),
-        ("0.5 " * 196, "on a line"),
         (" ".join(f"{x:.3f} 0.5" for x in FACE[:, 0]), "on a line"),
         ("0 0 1 1 " + "0.5 " * 192, "neighbour of none"),
     ],

@@ -105,6 +105,15 @@ def test_a_one_pixel_mask_is_one_window_an_empty_one_is_left_out():
     assert values == {"one": pytest.approx(ssim_map(image, truth)[7, 12].mean(), abs=1e-12)}
 
 
+def test_a_block_belongs_to_a_region_that_has_half_of_it():
+    image, truth = noisy_pair(3, 384, 390)  # blocks of 2 pixels a side
+    half, less = (np.zeros(image.shape[:2], bool) for _ in range(2))
+    half[40:42, 60] = less[40, 60] = True
+    values = ssim_downsampled.in_regions(image, truth, {"half": half, "less": less})
+    local = ssim_map(image, truth, ssim_downsampled.form)[20 - 5, 30 - 5]
+    assert values == {"half": pytest.approx(local.mean(), abs=1e-12)}
+
+
 def test_a_mask_that_does_not_fit_is_refused():
     image, truth = noisy_pair(2, 30, 30)
     for mask in (np.zeros((30, 29), bool), np.zeros((30, 30), np.uint8), None):

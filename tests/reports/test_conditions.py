@@ -33,7 +33,6 @@ def made(**conditions):
 @pytest.mark.parametrize(
     ("conditions", "notes", "machine"),
     [
-        ({"a": IDLE, "b": IDLE}, {}, "A (2 cores) with 2 threads"),
         ({"a": {**IDLE, "other_cores": OTHERS_LIMIT}, "b": IDLE}, {}, "A (2 cores) with 2 threads"),
         ({"a": IDLE, "b": BUSY}, {"b": LOADED.format(0.84)}, "A (2 cores) with 2 threads"),
         ({"a": [IDLE, BUSY], "b": [IDLE, IDLE]}, {"a": LOADED.format(0.84)}, "A (2 cores) with 2 threads"),
@@ -42,21 +41,13 @@ def made(**conditions):
             dict.fromkeys(("a", "b", "floor"), LOADED.format(1.26)),
             "A (2 cores) with 2 threads",
         ),
-        (
-            {"a": IDLE, "b": ONE},
-            {
-                "a": ELSEWHERE.format("A (2 cores) with 2 threads"),
-                "b": ELSEWHERE.format("A (2 cores) with 1 thread"),
-            },
-            "A (2 cores) with 2 threads; A (2 cores) with 1 thread",
-        ),
-        (
-            {"a": IDLE, "b": THERE},
-            {
-                "a": ELSEWHERE.format("A (2 cores) with 2 threads"),
-                "b": ELSEWHERE.format("B (8 cores) with 2 threads"),
-            },
-            "A (2 cores) with 2 threads; B (8 cores) with 2 threads",
+        *(
+            (
+                {"a": IDLE, "b": other},
+                {"a": ELSEWHERE.format("A (2 cores) with 2 threads"), "b": ELSEWHERE.format(name)},
+                f"A (2 cores) with 2 threads; {name}",
+            )
+            for other, name in ((ONE, "A (2 cores) with 1 thread"), (THERE, "B (8 cores) with 2 threads"))
         ),
         ({"a": IDLE, "b": IDLE, "floor": ONE}, {}, "A (2 cores) with 2 threads"),  # it is not compared
         ({"a": {}, "b": {}}, {}, "abacus, load not recorded"),

@@ -1,7 +1,5 @@
 """Printed tables as data, and runs in their form."""
 
-import json
-
 import pytest
 import yaml
 
@@ -127,10 +125,7 @@ def test_every_paper_has_the_schema_and_known_methods():
 
 
 CHANGES = [
-    (lambda p: p.update(titel="x"), "titel: expected one of .*Did you mean 'title'"),
-    (lambda p: p.pop("venue"), "venue: expected a value, found nothing"),
     (lambda p: p.update(arxiv="25.1"), "arxiv: a number such as 2504.14967"),
-    (lambda p: p["tables"][0].update(grade="D"), r"tables\[0\]\.grade"),
     (lambda p: p["tables"][0].update(rows=[]), "rows: at least one, each name once; found none"),
     (lambda p: p["tables"][0]["rows"][0].update(values={}), "values: at least one; found none"),
     (lambda p: p["tables"][0]["rows"][0]["values"].update(psnr="3"), "values: TASK/METRIC of .*; found psnr"),
@@ -149,11 +144,3 @@ def test_a_file_with_a_wrong_key_or_value_is_refused(tmp_path, change, message):
     (tmp_path / "paper.yaml").write_text(yaml.safe_dump(paper))
     with pytest.raises(InputError, match=message):
         build_file(Paper, tmp_path / "paper.yaml")
-
-
-def test_the_listing_has_every_paper_with_its_tables(capsys):
-    from headbench.bench import cli
-
-    assert cli.main(["list", "papers", "--json"]) == 0
-    (entry,) = [e for e in json.loads(capsys.readouterr().out) if e["name"] == PAPER]
-    assert "CVPR 2025, arXiv 2504.14967" in entry["summary"]

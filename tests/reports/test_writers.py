@@ -161,11 +161,6 @@ def marked(cells):
     return tuple(replace(cell, note=0) for cell in cells)
 
 
-def test_latex_of_a_nasty_name():
-    expected = r"a\_b\%\&\{x\}\$\#\textasciicircum{}\textasciitilde{}\textbackslash{}\textbar{}*\textless{}i\textgreater{}`é"
-    assert escape_latex(NASTY) == expected
-
-
 @given(st.text(max_size=40))
 def test_latex_text_has_no_live_character(text):
     escaped = escape_latex(text)

@@ -45,8 +45,7 @@ def scored(folder, run, out, label="theirs"):
     return rows[rows["metric"] == "psnr"].reset_index(drop=True)
 
 
-@pytest.mark.parametrize("layout", [".", "renders", "subject1"])
-def test_images_of_a_run_score_alike_in_every_layout(run, renders, images, tmp_path, layout):
+def test_images_of_a_run_score_alike_in_every_layout(run, renders, images, tmp_path):
     """Among them that of a run's cell; under their own label."""
     theirs = scored(images, run, tmp_path / "out")
     rows = pd.read_parquet(RunFolder(run).rows)
@@ -54,8 +53,10 @@ def test_images_of_a_run_score_alike_in_every_layout(run, renders, images, tmp_p
     assert set(theirs["method"]) == {"theirs"}
     same = [column for column in COLUMNS if column not in ("method", "version")]
     assert theirs[same].equals(own[same])
-    shutil.copytree(renders, tmp_path / "other" / layout, dirs_exist_ok=True)
-    assert scored(tmp_path / "other", run, tmp_path / "a").equals(theirs)
+    for number, layout in enumerate((".", "renders", "subject1")):
+        other = tmp_path / f"other-{number}"
+        shutil.copytree(renders, other / layout, dirs_exist_ok=True)
+        assert scored(other, run, tmp_path / f"out-{number}").equals(theirs)
 
 
 def test_a_failure_in_an_executor_names_its_reason_and_log(run, tmp_path, monkeypatch):

@@ -23,12 +23,10 @@ def clip(name, /, **parameters):
     ("condition", "match"),
     [
         (clip("cameras"), "conditions, cameras, parameters.part: expected a value"),
-        (clip("cameras", part=[1]), "part: expected text"),
         (clip("cameras", prt="1/2"), "Did you mean 'part'"),
         (clip("variant", name="x"), "expected a change of kind 'clip', found one of kind 'derive'"),
         (clip("camera", part="1/2"), "Did you mean 'cameras'"),
         (Condition("c", methods=("other",)), "methods of c"),
-        (Condition("a/b"), "without slashes"),
         (Condition("c", settings={"levle": 1}), "Did you mean 'level'"),
     ],
 )
@@ -42,11 +40,9 @@ def test_a_condition_that_cannot_be_had_is_refused(config, toy, condition, match
 @pytest.mark.parametrize(
     ("values", "match"),
     [
-        ({"conditions": []}, "at least one"),
         ({"conditions": [{}, {}]}, "each name once"),
         ({"conditions": [{"budget": "1/2"}]}, "a name for each"),
         ({"conditions": [{"name": "c", "budget": "2"}]}, "above 0 and at most 1"),
-        ({"conditions": [{"name": "c", "budget": "1e-999999999"}]}, "above 0 and at most 1"),
         ({"conditions": [{"name": "c", "derive": {"name": "variant"}}]}, "or a source that names"),
         (
             {"conditions": [{}, {"name": "c", "derive": {"name": "variant"}, "budget": "1/2"}]},
@@ -54,7 +50,6 @@ def test_a_condition_that_cannot_be_had_is_refused(config, toy, condition, match
         ),
         ({"conditions": [{"name": "c", "budget": "1/2"}], "source": "run"}, "nothing is trained"),
         ({"conditions": [{"name": "c", "clip": {"name": "cameras"}}], "source": "run"}, "nothing is trained"),
-        ({"conditions": "c"}, "a group of settings"),
     ],
 )
 def test_conditions_that_are_none_are_refused(values, match):

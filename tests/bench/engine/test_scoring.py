@@ -12,7 +12,7 @@ from headbench.bench.contracts import FrameKey
 from headbench.bench.engine import scoring
 from headbench.bench.engine.config import RunConfig, resolve_metrics
 from headbench.bench.engine.scoring import ScoredFrames, check_regions, score_frames
-from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
+from headbench.bench.errors import HeadbenchError, InputError, LeftOutError, UnavailableError
 from headbench.bench.specs import MetricSpec
 
 KEYS = [FrameKey("s", sequence, t, "a") for sequence, t in [("EMO", 0), ("EMO", 1), ("EMO", 2), ("FREE", 7)]]
@@ -75,6 +75,10 @@ def unavailable(image, truth):
 
 def noted(*images):
     raise UnavailableError("no weights.", "Get some.", "Weights missing.")
+
+
+def faceless(*images):
+    raise LeftOutError("no face is found")
 
 
 class NotedBatches(Difference):
@@ -157,6 +161,7 @@ def test_all_frames_of_a_sequence_have_the_value_of_their_video(spec):
     ("implementation", "fields", "reason"),
     [
         ("unavailable", {}, "no weights. Get some."),
+        ("faceless", {}, "left out: no face is found"),
         ("noted", {}, "Weights missing."),
         ("noted", {"kind": "temporal"}, "Weights missing."),
         ("noted", {"kind": "sequence"}, "Weights missing."),

@@ -125,7 +125,7 @@ def test_speed_is_measured_last_and_alone_also_after_an_end(config, rows_of, tmp
     with monkeypatch.context() as patch:
         patch.setattr("headbench.bench.executors.schedule.Processes", EndsAtSpeed)
         with pytest.raises(KeyboardInterrupt):
-            runner.run(config, TWO)
+            runner.run(config, replace(TWO, workers=1))
     rows = rows_of(config, TWO)
     assert set(rows[rows["method"] == "toy"]["status"]) == {"ok"}
     assert set(rows[rows["method"] == "once"]["status"]) == {"failed"}  # not trained again in that pass
@@ -144,7 +144,7 @@ class EndsAtSpeed(Processes):
 
 
 @pytest.mark.parametrize("subjects", [("subject1",)])
-def test_with_the_parent_killed_workers_end(config, command, tmp_path, rows_of, capsys):
+def test_with_the_parent_killed_workers_end(config, command, tmp_path, rows_of, capsys, monkeypatch):
     config = replace(config, methods=("dying_plugin:SLOW",))
     cell = cell_of(config, "subject1", "slow")
     first = command(config, *OPTIONS)
@@ -152,13 +152,14 @@ def test_with_the_parent_killed_workers_end(config, command, tmp_path, rows_of, 
     worker = read_outcome(cell)["process"]
     capsys.readouterr()
     assert cli.main(["status", config.out]) == 0
-    assert "1 cells: 0 waiting, 1 running, 0 done, 0 failed" in capsys.readouterr().out
+    assert "1 cell: 0 waiting, 1 running, 0 done, 0 failed" in capsys.readouterr().out
     first.kill()
     wait_for(lambda: not psutil.pid_exists(worker) and not is_locked(cell))
     assert cli.main(["status", config.out]) == 0
     assert "interrupted; start the run again" in capsys.readouterr().out
     (tmp_path / "go").touch()
-    assert command(config, *OPTIONS).wait(300) == 0
+    monkeypatch.chdir(tmp_path)
+    rows_of(config, replace(TWO, workers=1))
     assert (cell / "avatar" / "starts.log").read_text() == "xx"
     assert cli.main(["status", config.out]) == 0
     assert "1 done" in capsys.readouterr().out

@@ -28,6 +28,14 @@ def balls(monkeypatch):
 
 
 @pytest.fixture
+def no_sheets(monkeypatch):
+    """Leave out the drawing of contact sheets, which takes longer than all else that runs on balls do."""
+    monkeypatch.setattr(
+        "headbench.reports.robustness.sheets.write_sheet", lambda path, *args, **how: path.touch()
+    )
+
+
+@pytest.fixture
 def run_of(balls, tmp_path):
     """Makes a finished run of some methods on balls, its captures beside it."""
 

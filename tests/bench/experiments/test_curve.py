@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from PIL import Image
 
 from headbench.bench.condition import Condition, part_of_text
 from headbench.bench.contracts import Budget
@@ -20,6 +19,7 @@ from headbench.bench.experiments.curve import curve_run
 from headbench.bench.experiments.curve_settings import CurveSettings
 from headbench.bench.experiments.held_out import hold_out
 from headbench.datasets.synthetic.capture import synthesize
+from headbench.reports.curve import curve as report
 from headbench.reports.curve.curve import curve_runs
 from headbench.reports.curve.points import MEASURED
 from headbench.reports.curve.settings import CurveReportSettings
@@ -38,6 +38,7 @@ def plugin(monkeypatch):
         monkeypatch.syspath_prepend(TESTS / folder)
     monkeypatch.setattr(runner, "write_reports", lambda folder: [])
     monkeypatch.setattr(module, "METRICS", ("psnr", "storage"))
+    monkeypatch.setattr(report, "write_plot", lambda path, *args: path.touch())
     found = importlib.import_module("curve_plugin")
     found.FITS.clear()
     found.POSES.clear()
@@ -121,7 +122,6 @@ def test_less_to_train_on_is_measured_on_the_same_frames(make_run, plugin, over,
         ({(key.timestep, key.camera) for key in train}, budget.iterations) for train, budget in plugin.FITS
     ]
     assert trained == [(keys, 64) for keys in seen]
-    assert (run / f"curve-{over}" / "curve.png").is_file()
     measured = {(t, HELD_CAMERA) for t in (0, 1, 3)} | {(HELD_TIMESTEP, camera) for camera in "0134"}
     assert sorted(plugin.RENDERED) == sorted([*measured] * 3)
     assert [point[over] for point in findings.data["points"]] == [1, 2, 3]
@@ -188,7 +188,6 @@ def test_a_row_for_each_method_subject_and_part(make_run, plugin):
     assert float(first["psnr_camera"]) == pytest.approx(by_task["novel_view"])
     assert float(first["psnr_timesteps"]) == pytest.approx(by_task["self_reenactment"])
     assert "noting      1/4        16" in findings.text
-    assert Image.open(run / "curve" / "curve.png").width > 300
 
 
 def test_a_kill_half_way_ends_with_the_same_rows(make_run, plugin, monkeypatch):
@@ -234,10 +233,8 @@ def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):
     ("changes", "match"),
     [
         ({"fractions": ("0",)}, "above 0 and at most 1"),
-        ({"fractions": ("half",)}, "above 0 and at most 1"),
         ({"fractions": ("0.5", "1/2")}, "each once"),
         ({"over": "tracking_error", "levels": (4.5,)}, "from 0 to 4"),
-        ({"over": "seconds", "seconds": (0.0,)}, "above 0"),
         ({"over": "seconds", "seconds": (1e6,)}, "below 1,000,000"),
         ({"over": "seconds", "seconds": (30.0, 30.0000001)}, "six digits"),
         ({"every": 1}, "at least 2"),

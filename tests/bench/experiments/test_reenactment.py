@@ -51,6 +51,7 @@ def test_every_subject_is_driven_by_the_other_and_keyed_by_both(ball_run):
     assert identity["reason"].str.contains("no recorded frames").all()
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_another_performance_is_another_protocol(ball_run):
     folder = ball_run("BALL")
     hashes = set()
@@ -63,6 +64,7 @@ def test_another_performance_is_another_protocol(ball_run):
         reenact_run(settings(folder, frames=1, out=str(out)))
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_the_source_is_shown_in_the_same_camera(ball_run):
     folder = ball_run("BALL")
     reenact_run(settings(folder, camera="1"))
@@ -76,6 +78,7 @@ def test_the_source_is_shown_in_the_same_camera(ball_run):
     assert (read_png(source) == 200).all()
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_a_driver_beyond_what_the_avatar_bears_is_found(ball_run, monkeypatch, balls):
     folder = ball_run("BURSTING")
     assert reenact_run(settings(folder)).passed
@@ -96,6 +99,7 @@ def test_a_driver_beyond_what_the_avatar_bears_is_found(ball_run, monkeypatch, b
     }
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_a_source_beside_the_run_and_what_is_refused(ball_run, tmp_path, balls, monkeypatch):
     folder, others = ball_run("BALL"), tmp_path / "others"
     (others / "ball-cool").mkdir(parents=True)

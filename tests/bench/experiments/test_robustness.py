@@ -10,6 +10,7 @@ from headbench.bench.experiments.robustness import extremes_run, reenact_run
 from headbench.bench.experiments.robustness_settings import ExtremesSettings, ReenactSettings
 from headbench.bench.registry import get
 
+pytestmark = pytest.mark.usefixtures("no_sheets")
 CELLS = {
     f"{subject}/{method}/seed-0" for subject in ("ball-a", "ball-bee") for method in ("bursting", "listed")
 }

@@ -155,18 +155,14 @@ def test_ablations_change_ours_and_additions_make_ours_plus():
 @pytest.mark.parametrize(
     ("words", "match"),
     [
-        (["--methods", "nothing"], "nothing"),
         (["--preset", "huge"], "huge"),
         (["--ablations", "all", "--methods", "ga"], "ours among them"),
         (["--ablations", "no-lines", "fixed-sizes"], "fixed-sizes"),
         (["--tracked-ablations", "no-lines", "--tracked", "none"], "ours among those of --tracked"),
         (["--methods", "ours", "ga-official"], "checkout"),
         (["--tracked", "ours", "--methods", "ga"], "methods of tracked"),
-        (["--tracked", "ga", "none"], "names of methods, or none"),
-        (["--first", "0"], "at least 1"),
         (["--subjects", "2", "--first", "3"], "at most --subjects, 2"),
         (["--levels", "5"], "above 0 and at most 4"),
-        (["--performance", "still"], "natural"),
         (["--set", "preset=smoke"], "expected one of execution"),
     ],
 )

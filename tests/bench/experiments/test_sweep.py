@@ -1,8 +1,10 @@
 """A sweep of toy avatars: rows of known levels, resumed and refused."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
-from headbench.bench.engine import run as runner
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.experiments import sweep as module
@@ -11,19 +13,21 @@ from headbench.bench.experiments.sweep_settings import SweepSettings
 from headbench.bench.io.documents import read_json
 from headbench.bench.rows import ALL, Rows
 
-from ...world import run_on
+
+@pytest.fixture
+def subjects():
+    return ("subject1", "subject2")
 
 
 @pytest.fixture
-def finished(toy, tmp_path, monkeypatch):
+def finished(toy, config, finished, monkeypatch):
     """The folder of a finished run of two methods, one of which has variants."""
-    monkeypatch.setattr(runner, "write_reports", lambda folder: [])
     monkeypatch.setattr(module, "default_names", lambda group: ())
-    toy.MADE.clear()
     methods = ("toy_plugin:METHOD", "toy_plugin:VARYING")
     metrics = ("toy_plugin:ERROR", "toy_plugin:FILES", "toy_plugin:STEPS")
-    how = {"subjects": ("subject1", "subject2"), "metrics": metrics, "reader": "toy_plugin:READER"}
-    return run_on(tmp_path / "data", tmp_path / "run", *methods, **how).root
+    finished(replace(config, methods=methods, metrics=metrics))
+    toy.MADE.clear()
+    return Path(config.out)
 
 
 def swept(run, **settings):

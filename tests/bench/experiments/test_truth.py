@@ -29,7 +29,7 @@ FRAMES, SAMPLES = 2 + 2 * 2 + 2, 2 * 2
 def job(tmp_path_factory):
     """A cell of a small synthetic capture; its truth is rendered once for all avatars."""
     root = tmp_path_factory.mktemp("truth")
-    how = {"performance": "full", "workers": 1, "tracking_error": 1.0}
+    how = {"performance": "full", "workers": 1, "tracking_error": 1.0, "samples_per_pixel": 4}
     with flat_pictures():  # of which the truth needs none
         (capture,) = synthesize(root / "data", cameras=3, timesteps=8, size=(48, 70), **how)
     condition = Condition(drive=Named("extremes", PARAMETERS))

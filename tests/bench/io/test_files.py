@@ -42,20 +42,6 @@ def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_results_are_readable_in_every_layout_of_parquet(tmp_path):
-    """safetensors writes beside the file it is given and renames, which leaves the mode of a private file."""
-    path = tmp_path / "new" / "a.txt"
-    with atomic_path(path) as temporary:
-        assert temporary.suffix == ".txt"
-        private = temporary.with_name("private")
-        private.write_text("new")
-        private.chmod(0o600)
-        private.replace(temporary)
-    usual = tmp_path / "b.txt"
-    usual.write_text("usual")
-    assert path.stat().st_mode == usual.stat().st_mode
-
-
 def test_digests_tell_values_types_shapes_and_order_apart():
     arrays = [np.zeros(4), np.zeros((2, 2)), np.zeros(4, np.float32), np.ones(4)]
     values = [*((array,) for array in arrays), ("ab", "c"), ("a", "bc"), ({"a": 1},), ({"a": 2},)]
@@ -103,15 +89,6 @@ def test_an_accepted_name_stays_directly_in_its_folder(name):
         assert not re.fullmatch(r"\w[\w ()+.-]{0,99}", name, re.ASCII)
         return
     assert os.path.dirname(os.path.normpath(f"/folder/{name}")) == "/folder"
-
-
-def test_an_error_of_the_system_names_the_file_meant(tmp_path):
-    with pytest.raises(OSError, match="a.png") as caught, atomic_path(tmp_path / "a.png"):
-        raise OSError(errno.ENOSPC, "No space left on device")
-    assert caught.value.filename == str(tmp_path / "a.png")
-    with pytest.raises(OSError, match="^nothing of the system$"), atomic_path(tmp_path / "a.png"):
-        raise OSError("nothing of the system")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_file_is_flushed_before_its_rename(tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from headbench.bench.io.style import SHAPES, policy_hash, stylesheet
+from headbench.bench.io.style import policy_hash, stylesheet
 
 
 def luminance(colour):
@@ -28,10 +28,6 @@ METHODS = [name for name in COLOURS if re.fullmatch("m[0-9]", name)]
 def test_colours_of_text_marks_and_borders_stand_out(scheme, name):
     paper, colour = (COLOURS[key].split(", ")[scheme] for key in ("paper", name))
     assert contrast(paper, colour) >= (3 if name == "rule" else 4.5)
-
-
-def test_every_mark_has_a_shape_and_a_colour():
-    assert len(set(SHAPES)) == len(SHAPES) == len(METHODS)
 
 
 def test_the_hash_is_that_of_the_standard():

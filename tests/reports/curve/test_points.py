@@ -5,7 +5,9 @@ from fractions import Fraction
 import pytest
 
 from headbench.bench.contracts import Budget
+from headbench.bench.io.images import read_png
 from headbench.reports.curve import curve
+from headbench.reports.curve.plot import CurvePanel, write_plot
 from headbench.reports.curve.points import CurvePoint, mean_point
 
 
@@ -19,23 +21,8 @@ from headbench.reports.curve.points import CurvePoint, mean_point
     ],
 )
 def test_a_mean_has_an_interval_from_three_subjects(values, mean, half):
-    points = [
-        CurvePoint(
-            "a",
-            str(index),
-            (1.0,),
-            Fraction(1),
-            Budget(iterations=2),
-            3,
-            4,
-            12,
-            None,
-            {"megabytes": 2.0},
-            {"psnr": value},
-            {},
-        )
-        for index, value in enumerate(values)
-    ]
+    part = Fraction(1), Budget(iterations=2), 3, 4, 12, None, {"megabytes": 2.0}
+    points = [CurvePoint("a", str(i), (1.0,), *part, {"psnr": v}, {}) for i, v in enumerate(values)]
     found = mean_point(points)
     assert (found.values["psnr"], found.cost["megabytes"]) == (mean, 2.0)
     assert found.halves["psnr"] == (None if half is None else pytest.approx(half))
@@ -57,3 +44,16 @@ def test_the_plot_says_what_is_held_out(monkeypatch, tmp_path, tasks, says):
     empty = curve.CurveData("cameras", ["s"], [], [], [], tasks, "seconds", {}, 3, {}, {})
     curve.write_curve(tmp_path / "curve.png", empty)
     assert says in notes[0]
+
+
+def test_a_plot_has_each_method_and_no_line_where_none_is(tmp_path):
+    lines = {"a": [(1.0, 20.0, 0.0), (4.0, 22.0, 0.5)], "b": [(2.0, 21.0, 0.0)]}
+    panels = [CurvePanel("PSNR", lines, ""), CurvePanel("LPIPS", {}, "no weights")]
+    write_plot(tmp_path / "curve.png", [panels], "Seconds", "A note.")
+    picture = read_png(tmp_path / "curve.png")
+    blue, vermilion = (
+        (picture == colour).all(axis=2).any(axis=0) for colour in ((0, 114, 178), (213, 94, 0))
+    )
+    half = picture.shape[1] // 2
+    assert blue[:half].sum() > vermilion[:half].sum() > 0
+    assert not blue[half:].any()

@@ -107,17 +107,6 @@ def test_frames_follow_keys_and_error_maps(opened, toy_run):
     assert "the training diverged" in tab.locator("#tiles .reason").nth(2).text_content()
 
 
-def test_play_steps_through_the_frames(opened, toy_run):
-    tab = opened(toy_run)
-    pixels(tab, "toy")
-    before = tab.locator("#where").text_content()
-    tab.keyboard.press(" ")
-    assert tab.locator("#play").get_attribute("aria-label") == "Pause"
-    changed(tab, "where", before)
-    tab.keyboard.press(" ")
-    assert tab.locator("#play").get_attribute("aria-label") == "Play the frames"
-
-
 def test_the_held_key_t_shows_the_truth_everywhere(opened, toy_run):
     tab = opened(toy_run)
     truth, render = pixels(tab, "Ground truth"), pixels(tab, "toy")
@@ -130,17 +119,6 @@ def test_the_held_key_t_shows_the_truth_everywhere(opened, toy_run):
     assert canvases.nth(1).evaluate("c => c.toDataURL()") == canvases.nth(0).evaluate("c => c.toDataURL()")
     tab.keyboard.up("t")
     assert pixels(tab, "toy") == render
-
-
-def test_keys_can_be_switched_off(opened, toy_run):
-    tab = opened(toy_run)
-    pixels(tab, "toy")
-    tab.keyboard.press("?")
-    tab.uncheck("#keys")
-    tab.click("#close")
-    tab.locator("body").press("e")
-    assert not tab.is_checked("#errors")
-    tab.wait_for_url("**keys=off")
 
 
 def test_the_wheel_zooms_focused_pictures_only(opened, toy_run):

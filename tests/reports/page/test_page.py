@@ -89,8 +89,9 @@ def numbers(table):
     return {row[0][1].strip(): [cell[0] for cell in row[1:]] for row in body}
 
 
-def test_the_tables_show_the_numbers_of_headbench_table(page, write_run):
-    run = write_run("run", {"good": 30.0, "better": 31.25, "mean-image": 12.0})
+def test_a_written_run_has_its_tables_front_and_names(page, write_run):
+    """The numbers of `headbench table`, the methods that none beats, and a hostile name as text."""
+    run = write_run("run", {HOSTILE: 30.0, "better": 31.0, "mean-image": 12.0})
     found = page([run])
     known = layouts(RunSet.read([run]))
     asked = [json.loads(table_text([run], "json", name)) for name in known]
@@ -101,6 +102,15 @@ def test_the_tables_show_the_numbers_of_headbench_table(page, write_run):
             r["method"]: [None if c["value"] is None else str(c["value"]) for c in r["cells"]] for r in rows
         }
         assert numbers(table) == wanted
+    plots = found.data["plots"]
+    assert [plot["x"] for plot in plots] == ["Size (MB)", "Frame time (ms)"] * 2
+    size, time = plots[:2]
+    assert size["points"] == [[HOSTILE, 8.0, 30.0], ["better", pytest.approx(8.1), 31.0]]
+    assert [point[1] for point in time["points"]] == pytest.approx([1000 / 130, 1000 / 131])
+    assert (size["front"], time["front"]) == ([0, 1], [1])
+    assert found.data["methods"] == [HOSTILE, "better"]
+    assert [tag for tag, _ in found.elements].count("script") == 4
+    assert not [a for tag, a in found.elements if tag == "img" and a["src"] == "x"]
 
 
 def test_parts_are_the_regions_and_sequences_of_the_run(page, write_run):
@@ -129,15 +139,6 @@ def test_tables_in_the_form_of_a_paper_have_its_rows(page, write_run):
         assert any(wanted.items() <= table.items() for table in tables), number
     with pytest.raises(InputError, match="tensorial-2025"):
         page([run], papers=("tensorial-2024",))
-
-
-def test_the_front_joins_the_methods_that_none_beats(page, write_run):
-    plots = page([write_run("run", {"a": 30.0, "b": 31.0, "mean-image": 12.0})]).data["plots"]
-    assert [plot["x"] for plot in plots] == ["Size (MB)", "Frame time (ms)"] * 2
-    size, time = plots[:2]
-    assert size["points"] == [["a", 8.0, 30.0], ["b", pytest.approx(8.1), 31.0]]
-    assert [point[1] for point in time["points"]] == pytest.approx([1000 / 130, 1000 / 131])
-    assert (size["front"], time["front"]) == ([0, 1], [1])
 
 
 def test_pictures_are_the_pixels_of_renders_and_capture(toy_page, toy_run):
@@ -192,13 +193,6 @@ def test_damaged_images_leave_the_others(page, toy_run, toy, monkeypatch):
     assert any(".png: " in reason and "PNG" in reason for reason in reasons)
 
 
-def test_without_renders_the_page_says_so(page, toy_run):
-    for path in toy_run.rglob("*.png"):
-        path.unlink()
-    found = page()
-    assert {found.data["reasons"][-1 - entry["p"][1]] for entry in found.data["frames"]} == {"not rendered"}
-
-
 def test_nothing_refers_to_another_place(toy_page, toy_run):
     found = toy_page
     for tag, attributes in found.elements:
@@ -213,14 +207,6 @@ def test_nothing_refers_to_another_place(toy_page, toy_run):
     assert "unsafe" not in policy
     assert "http" not in re.sub(r"http://www\.w3\.org/2000/svg", "", found.texts["script"])
     assert str(toy_run.parents[1]) not in " ".join(found.texts.values())
-
-
-def test_hostile_names_stand_as_text(page, write_run):
-    found = page([write_run("run", {HOSTILE: 30.0, "other": 31.0})])
-    assert found.data["methods"] == [HOSTILE, "other"]
-    assert HOSTILE in numbers(found.tables[0])
-    assert [tag for tag, _ in found.elements].count("script") == 4
-    assert not [a for tag, a in found.elements if tag == "img" and a["src"] == "x"]
 
 
 def test_an_error_cannot_end_the_script_it_stands_in(page, toy_run):

@@ -11,7 +11,6 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
@@ -187,14 +186,6 @@ def test_a_plot_without_measured_costs_is_drawn(tmp_path):
     write_plot(tmp_path / "plot.png", [point("$x", method="a$b_$")], COSTS, "PSNR", higher_is_better=True)
     width, height = Image.open(tmp_path / "plot.png").size
     assert width > 2 * height
-
-
-def test_a_matplotlibrc_changes_no_plot(tmp_path):
-    points = [point("half"), point("", 21.0, 2.0, 5.0)]
-    write_plot(tmp_path / "a.png", points, COSTS, "PSNR", higher_is_better=True)
-    with rc_context({"text.usetex": True, "savefig.dpi": 30, "axes.facecolor": "red"}):
-        write_plot(tmp_path / "b.png", points, COSTS, "PSNR", higher_is_better=True)
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 SMALL = st.integers(0, 6)  # many ties

@@ -123,10 +123,3 @@ def test_what_is_saved_comes_as_files(scene, opened):
             content = download.value.path().read_bytes()
             assert content.startswith(start)
             assert b"trainedAlgorithmicMedia" in content or b"ompositeWithTrainedAlgorithmicMedia" in content
-
-
-@pytest.mark.slow
-def test_a_server_can_be_started_again(scene, opened):
-    for _ in range(2):
-        with serve(scene) as server:
-            settled(opened(server))
