@@ -7,7 +7,7 @@ import pytest
 from headbench.bench.contracts import Budget
 from headbench.bench.io.images import read_png
 from headbench.reports.curve import curve
-from headbench.reports.curve.plot import CurvePanel, write_plot
+from headbench.reports.curve.curve import CurvePanel, write_plot
 from headbench.reports.curve.points import CurvePoint, mean_point
 
 

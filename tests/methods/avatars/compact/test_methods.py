@@ -10,6 +10,7 @@ from headbench.methods.avatars.compact import layouts
 from headbench.methods.avatars.compact.codecs import parts_of, write_coded
 from headbench.methods.avatars.compact.container import Content, read_content
 from headbench.methods.avatars.compact.precision import EXACT, Precision
+from headbench.methods.avatars.derived.recipes import STEPS, coded_name
 from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.flashavatar.method import FlashAvatar
 from headbench.methods.ga.config import GAConfig
@@ -133,9 +134,11 @@ def test_arrays_that_are_missing_cut_or_foreign_are_refused(trained, tmp_path, m
     refused(arrays, steps={**content.steps, "positions": -1.0})
 
 
-@pytest.mark.parametrize("name", sorted({*TRAINED, "ours", "ours-plus"}))
-def test_every_method_has_a_coded_variant_for_each_step(name):
-    assert callable(resolve(get("methods", name).variants))
+def test_a_coded_avatar_is_made_for_each_step(clip, tmp_path):
+    store(clip, tmp_path / "avatar")
+    variants = {v.name: v for v in resolve(get("methods", "ours").variants)(tmp_path / "avatar", clip, "cpu")}
+    sizes = [size(variants[coded_name(s)].make(tmp_path / coded_name(s))) for s in sorted(STEPS)]
+    assert sizes == sorted(sizes, reverse=True)
 
 
 def test_only_trained_avatars_are_coded(clip, tmp_path):
