@@ -44,8 +44,7 @@ def test_tables_of_a_video_say_what_is_missing(videos, tmp_path, layout):
     assert text.count("Novel view") == 1
 
 
-def test_methods_train_on_a_video(videos, tmp_path):
-    rows = compare(videos / "insta", tmp_path / "out", "ga", "ours", "gbs")
-    assert set(rows["method"]) == {"ga", "ours", "gbs"}
+def test_a_method_trains_on_a_video(videos, tmp_path):
+    rows = compare(videos / "insta", tmp_path / "out", "ga")
     assert (rows["status"] == "ok").all()
     assert rows["value"].between(1, 60).all()

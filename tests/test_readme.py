@@ -112,18 +112,8 @@ def test_the_container_copies_every_package_and_no_more():
     packages = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["scikit-build"]["wheel"][
         "packages"
     ]
-    files = {
-        "CMakeLists.txt",
-        "LICENSE",
-        "README.md",
-        "__init__.py",
-        "py.typed",
-        "pyproject.toml",
-        "requirements.txt",
-        "requirements-dev.txt",
-        "requirements-torch-cpu.txt",
-        "requirements-torch-cuda.txt",
-    }
+    files = {"CMakeLists.txt", "LICENSE", "README.md", "__init__.py", "py.typed", "pyproject.toml"}
+    files |= {f"requirements{kind}.txt" for kind in ("", "-dev", "-torch-cpu", "-torch-cuda")}
     assert copied == set(packages.values()) | files
     assert all((ROOT / name).exists() for name in copied)
 

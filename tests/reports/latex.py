@@ -1,4 +1,4 @@
-"""Checks of LaTeX tables: by a small parser, and by pdfLaTeX where it is installed."""
+"""Checks of LaTeX tables by pdfLaTeX, where it is installed."""
 
 import re
 import shutil
@@ -6,19 +6,6 @@ import subprocess
 from pathlib import Path
 
 import pytest
-
-COMMANDS = set(
-    re.findall(
-        r"\w+",
-        """
-        providecommand begin end centering setlength tabcolsep caption label sbox toprule midrule bottomrule cmidrule
-        multicolumn emph textbf underline textit textsf textsuperscript scriptsize footnotesize ifdim wd linewidth
-        resizebox usebox else fi par pm times mu uparrow downarrow rightarrow dots textbackslash textasciicircum
-        textasciitilde textless textgreater textbar texttt tabfirst tabsecond tabthird tabspread tabpublished
-        """,
-    )
-)
-"""What LaTeX, booktabs and graphicx define, and the table's own macros."""
 
 ARTICLE = r"""\documentclass{article}
 \usepackage{booktabs,graphicx}
@@ -36,31 +23,6 @@ def depth(text):
         if count < 0:
             return -1
     return count
-
-
-def check_latex(text):
-    """Assert that a table has balanced braces and environments, lines of one width and known commands alone.
-
-    Returns its lines without comments.
-    """
-    code = [line for line in text.splitlines() if not line.startswith("%")]
-    joined = "\n".join(code)
-    assert depth(joined) == 0
-    open_environments = []
-    for kind, name in re.findall(r"\\(begin|end)\{(\S+?)\}", joined):
-        if kind == "begin":
-            open_environments.append(name)
-        else:
-            assert open_environments.pop() == name
-    assert open_environments == []
-    assert set(re.findall(r"\\([A-Za-z]+)", joined.replace(r"\\", ""))) <= COMMANDS
-    (form,) = re.findall(r"\\begin\{tabular\}\{(\w+)\}", joined)
-    rows = [line for line in code if line.endswith(r"\\")]
-    assert len(rows) > 2
-    for line in rows:
-        spanned = sum(int(n) - 1 for n in re.findall(r"\\multicolumn\{(\d+)\}", line))
-        assert len(re.findall(r"(?<!\\)&", line)) + spanned == len(form) - 1, line
-    return code
 
 
 def compile_latex(texts, folder):

@@ -9,17 +9,8 @@ TASKS = ("novel_view", "self_reenactment")
 def row(method, metric, value, subject="s", sequence="EMO", timestep=0, camera="a", **changes):
     """A value of a frame of novel view, by protocol "h"; ``changes`` are other columns."""
     given = {"seed": 0, "task": "novel_view", "region": "full", "protocol": "h", **changes}
-    return Row(
-        method=method,
-        version="1",
-        subject=subject,
-        sequence=sequence,
-        timestep=timestep,
-        camera=camera,
-        metric=metric,
-        value=value,
-        **given,
-    )
+    place = {"subject": subject, "sequence": sequence, "timestep": timestep, "camera": camera}
+    return Row(method=method, version="1", metric=metric, value=value, **place, **given)
 
 
 def avatar_row(method, metric, value, subject="s", **changes):

@@ -20,7 +20,7 @@ from headbench.reports.writers import (
     to_text,
 )
 
-from .latex import check_latex, compile_latex, depth
+from .latex import compile_latex, depth
 from .made_rows import table_of
 
 NASTY = "a_b%&{x}$#^~\\|*<i>`é"
@@ -107,9 +107,8 @@ def test_csv_holds_no_formula_of_a_spreadsheet(value, cell):
     assert line == [cell, "1"]
 
 
-def test_latex_is_a_balanced_booktabs_table(table):
+def test_latex_is_a_booktabs_table_with_marks(table):
     text = to_latex(table)
-    check_latex(text)
     assert re.findall(r"\\begin\{(\S+?)\}", text) == ["table*", "tabular", "minipage"]
     for rule in (r"\toprule", r"\midrule", r"\bottomrule", r"\cmidrule(lr){2-3} \cmidrule(lr){4-5}"):
         assert rule in text
@@ -117,7 +116,7 @@ def test_latex_is_a_balanced_booktabs_table(table):
     assert r"\tabfirst{30.13}" in text
     assert r"\tabsecond{25.50}" in text
     assert r"--\textsuperscript{1}" in text
-    assert r"\providecommand{\tabfirst}" in text
+    assert r"\providecommand{\tabfirst}[1]{\textbf{#1}}" in text
     assert r"No 100\% weights\_file." in text
 
 
@@ -150,9 +149,7 @@ def test_latex_compiles_whatever_names_hold(table, tmp_path):
         for number, name in enumerate(names)
     ]
     texts = [to_latex(one) for one in tables]
-    for text in texts:
-        check_latex(text)
-        assert r"\tabfirst{30.13}\textsuperscript{1}" in text
+    assert all(r"\tabfirst{30.13}\textsuperscript{1}" in text for text in texts)
     compile_latex(texts, tmp_path)
 
 

@@ -108,7 +108,7 @@ def test_a_written_run_has_its_tables_front_and_names(page, write_run):
     assert size["points"] == [[HOSTILE, 8.0, 30.0], ["better", pytest.approx(8.1), 31.0]]
     assert [point[1] for point in time["points"]] == pytest.approx([1000 / 130, 1000 / 131])
     assert (size["front"], time["front"]) == ([0, 1], [1])
-    assert found.data["methods"] == [HOSTILE, "better"]
+    assert found.data["methods"] == [HOSTILE, "better", "mean-image"]
     assert [tag for tag, _ in found.elements].count("script") == 4
     assert not [a for tag, a in found.elements if tag == "img" and a["src"] == "x"]
 
