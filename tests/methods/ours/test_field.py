@@ -83,7 +83,7 @@ def test_the_network_starts_within_its_fan_in_with_its_norms():
     np.testing.assert_allclose(normalised_weight(network, 0), direction, atol=1e-7)
 
 
-def test_lines_of_expressions_and_of_jaw_bases_are_summed_by_their_own_weights():
+def test_lines_are_summed_by_expression_and_by_jaw_weights():
     lines, expression, jaw = torch.randn(5, 3, 4, 2), torch.randn(3), torch.tensor([0.8, 0.2])
     expected = [np.einsum("k,kalc->alc", w, each) for w, each in ((expression, lines[:3]), (jaw, lines[3:]))]
     np.testing.assert_allclose(blend_lines(lines, expression, jaw), expected, atol=1e-6)
