@@ -72,7 +72,14 @@ def psnr(spec, clip, folder):
 
 @pytest.mark.parametrize(
     "spec",
-    [FLASHAVATAR, GA, GBS, GHA, pytest.param(INSTA, marks=pytest.mark.slow), OURS, RGBAVATAR],
+    [
+        FLASHAVATAR,
+        GA,
+        GBS,
+        OURS,
+        RGBAVATAR,
+        *(pytest.param(one, marks=pytest.mark.slow) for one in (GHA, INSTA)),
+    ],
     ids=lambda spec: spec.name,
 )
 def test_a_world_far_from_its_origin_is_as_good(clip, tmp_path, spec):

@@ -72,7 +72,7 @@ def _file_cut_off_or_overwritten(capture, data):
 @pytest.mark.parametrize(
     "damage", [_junk_in_frames, _junk_in_the_declaration, _junk_in_parameters, _file_cut_off_or_overwritten]
 )
-@settings(max_examples=3, deadline=None, suppress_health_check=[*HealthCheck], derandomize=True)
+@settings(max_examples=2, deadline=None, suppress_health_check=[*HealthCheck], derandomize=True)
 @given(data=st.data())
 def test_damage_ends_with_findings(pristine, tmp_path, damage, data):
     capture = pristine.copied(tmp_path / f"{next(_numbers)}")

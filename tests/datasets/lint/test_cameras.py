@@ -85,12 +85,6 @@ def _aside(metres: float, axis: int) -> Plant:
     return _move(shift)
 
 
-def _rotated(degrees: float, axis: int) -> Plant:
-    turn = np.eye(4)
-    turn[:3, :3] = cv2.Rodrigues(np.radians(degrees) * np.eye(3)[axis])[0]
-    return _move(lambda matrix: matrix @ turn)
-
-
 def _late(frames: int) -> Plant:
     """Images (and masks) of so many frames before, within each sequence."""
 
@@ -129,7 +123,6 @@ class CameraFault(NamedTuple):
 CAMERA_FAULTS = (
     CameraFault("exchanged", "HB513", exchange),
     CameraFault("3 cm aside", "HB514", _aside(0.03, 0)),
-    CameraFault("tilted by 1 degree", "HB514", _rotated(1.0, 0)),
     CameraFault("2 frames late", "HB515", _late(2)),
     CameraFault("blurred by 4 px", "HB517", _each(lambda image: cv2.GaussianBlur(image, (0, 0), 4.0))),
     CameraFault("black", "HB308", _each(np.zeros_like)),

@@ -154,10 +154,10 @@ def posed(surface):
 
 
 @needs_kernel
-@pytest.mark.parametrize("spread", [0.002, 0.02, 0.3])
+@pytest.mark.parametrize("spread", [0.002, 0.3])
 def test_the_kernel_finds_the_nearest_triangle_of_all(posed, spread):
     rng = np.random.default_rng(1)
-    base = posed.vertices.numpy()[rng.integers(0, len(posed.vertices), 1500)]
+    base = posed.vertices.numpy()[rng.integers(0, len(posed.vertices), 500)]
     points = (base + spread * rng.standard_normal(base.shape)).astype(np.float32)
     found = posed.nearest(points)
     all_of_them = squared_distances(torch.from_numpy(points).double(), posed.corners.double()).sqrt()
@@ -170,8 +170,8 @@ def test_the_kernel_finds_the_nearest_triangle_of_all(posed, spread):
 
 
 @needs_kernel
-@pytest.mark.parametrize("away", [0.0, 0.003, 0.05, 0.5])
-@pytest.mark.parametrize("spread", [1e-6, 0.001, 0.004, 0.02])
+@pytest.mark.parametrize("away", [0.0, 0.003, 0.5])
+@pytest.mark.parametrize("spread", [1e-6, 0.004, 0.02])
 def test_points_together_find_what_each_finds_alone(posed, away, spread):
     rng = np.random.default_rng(4)
     middles = posed.vertices.numpy()[rng.integers(0, len(posed.vertices), 40)] * (1 + away / 0.1)

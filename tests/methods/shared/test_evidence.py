@@ -53,7 +53,7 @@ class Performer:
 
     def _plan(self, tracker, level):
         settings = SyntheticSettings(
-            *(1, 5, 60, (72, 104), "procedural", 4100, 0.0, 1),
+            *(1, 3, 60, (72, 104), "procedural", 4100, 0.0, 1),
             performance=self._performance,
             tracker=tracker,
             tracking_error=level,
