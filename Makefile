@@ -15,7 +15,7 @@ help:
 	@echo "make setup   make $(VENV) with headbench in it, from the lock (TORCH=cpu or cuda chooses PyTorch's build)"
 	@echo "make lock    write the lock again, requirements*.txt, with the newest versions that pyproject.toml admits"
 	@echo "make demo    compare avatar methods on a capture made on the spot (OUT=$(OUT))"
-	@echo "make pictures  pictures of a demo (OUT=$(OUT)), in docs/pictures; of the page REPORT=FILE for the README"
+	@echo "make pictures  pictures of a demo (OUT=$(OUT)), in docs/pictures; of the page REPORT=FILE"
 	@echo "make docs    build the documentation, in build/docs"
 	@echo "make test    run the tests (in JOBS=$(JOBS) processes)"
 	@echo "make test-latest  run the tests with the newest versions instead of the lock, in $(VENV)-latest"
@@ -26,6 +26,7 @@ help:
 	@echo "make gpu     does a GPU give the CPU's numbers, and how fast; WHEELS=DIR collects wheels to install without a network"
 	@echo "make gate    compare the numbers of a small demo with tests/demo_baseline.json"
 	@echo "make baseline  write that baseline again, after a change that is meant to move them"
+	@echo "make readme  store a new demo, and write its tables into README.md and docs/"
 	@echo "make bench   measure the speed of the splat renderer"
 	@echo "make dist    sdist, and manylinux wheel for this machine, in dist/ (URL=the repository's public address)"
 	@echo "make wheels  manylinux wheels for x86-64 and aarch64, all Pythons; needs docker or podman"
@@ -65,8 +66,8 @@ docs: setup
 	$(BIN)/python -m sphinx -W --keep-going --quiet -j $(JOBS) -d build/docs-cache docs build/docs
 	@echo "The documentation is in build/docs/index.html."
 
-# The page of a demo's avatar and faults of footage on its capture, in docs/pictures, and the picture of the README, of any run's
-# report.
+# The page of a demo's avatar and faults of footage on its capture, in docs/pictures, and a picture of any run's report, for the
+# start page of the documentation.
 pictures: setup
 	$(BIN)/python docs/_ext/footage.py $(firstword $(wildcard $(OUT)/capture/UNION*))
 	$(BIN)/python docs/_ext/pictures.py $(OUT) $(or $(REPORT),$(OUT)/report.html)
@@ -124,7 +125,7 @@ baseline: setup
 bench: setup
 	$(BIN)/headbench doctor bench splats
 
-# The documentation's table and picture of the demo are those of the last one.
+# Stores the rows of a demo, and writes its tables into the README and the documentation.
 readme: demo
 	$(BIN)/python docs/_ext/stored_results.py demo $(OUT) .
 

@@ -1,51 +1,58 @@
-"""Stores finished runs in reports/gallery, and writes their tables into the README and the documentation.
+"""Stores finished runs in reports/gallery, and writes their tables and sentences into the README and the documentation.
 
 python docs/_ext/stored_results.py WHAT OUT .
 
 WHAT is demo, suite, profiles or faces (a run of one subject), further (a folder of runs) or curves (a folder of seconds and
-pictures); OUT is the folder of the run or runs.
+pictures); OUT is the folder of the run or runs. A block of a page is between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``.
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import groupby, product
 from pathlib import Path
+from statistics import fmean
 
-import stored_blocks
+import readme_pictures
 
+from headbench.bench.engine.scoring import FULL
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
-from headbench.bench.experiments import suite_settings as plan
 from headbench.bench.experiments.robustness import RECORD_FILE
 from headbench.bench.io.files import write_json, write_text
 from headbench.bench.progress import counted
+from headbench.bench.protocol import TASK_TITLES, UNSEEN_CAMERAS
+from headbench.bench.registry import get
 from headbench.bench.rows import Rows
+from headbench.reports.aggregate import summarise
 from headbench.reports.coded import coded_labels
-from headbench.reports.curve.curve import read_curve, write_curve
-from headbench.reports.protocols import USUAL, choice_effects
-from headbench.reports.runs import RunData, RunSet, synthetic_settings
-from headbench.reports.statistics.primary import primary_table
+from headbench.reports.curve.curve import CurveData, leaders_text, read_curve
+from headbench.reports.curve.points import HELD_OUT
+from headbench.reports.protocols import choice_effects
+from headbench.reports.runs import FrameSelection, RunData, RunSet
+from headbench.reports.statistics.comparisons import PairedComparison, compare
 from headbench.reports.suite.extremes import FOLDER, read_extremes
 from headbench.reports.suite.suite import suite_report, suite_runs
 from headbench.reports.table_report import Columns, table_of
-from headbench.reports.writers import to_markdown
+from headbench.reports.tables import build_table
+from headbench.reports.writers import pipe_table, to_markdown, to_text
 
-PAGES = {
-    "demo": "docs/explanation/results.md",
-    "suite": "README.md",
-    "protocols": "docs/explanation/protocols.md",
-    "drops": "docs/explanation/results.md",
-    "ablations": "docs/explanation/methods/ours.md",
-    "profiles": "docs/explanation/protocols.md",
-    "faces": "docs/explanation/metrics.md",
-    "further": "docs/explanation/methods/rgbavatar.md",
-    **{f"curves-{over}": "docs/explanation/results.md" for over in stored_blocks.UNITS},
-}
-"""The page of each block, in the repository."""
-CHANGED = (f"ours+{plan.EQUAL}", f"gbs+{plan.AS_TRACKED}")
-"""Conditions that the README shows."""
-BESIDE = ((CHANGED[0], "ga"), ("ours-plus", "ga"), ("gbs", "ga"), (CHANGED[1], "gbs"))
-"""Pairs of the README's exploratory differences."""
+NOVEL, FACE, DOCS = "novel_view", "face", "docs/explanation"
+OURS, REFERENCE = "ours", "ga"
+BESIDE = (OURS, "ours+equal-iterations", "ours-plus", "gbs", "gbs+as-tracked")
+"""Methods of the results page's differences from `REFERENCE`."""
+COLUMNS = (
+    ("Face PSNR, novel views (dB) ↑", FACE, "psnr", NOVEL, 1),
+    ("Face PSNR, new expressions (dB) ↑", FACE, "psnr", UNSEEN_CAMERAS, 1),
+    ("PSNR (dB) ↑", FULL, "psnr", NOVEL, 1),
+    ("SSIM ↑", FULL, "ssim", NOVEL, 3),
+    ("LPIPS ↓", FULL, "lpips", NOVEL, 3),
+    ("MB ↓", FULL, "storage", "", 1),
+    ("ms a frame ↓", FULL, "latency_p50", "", 0),
+    ("s of training ↓", FULL, "training_processor", "", 0),
+)
+"""Of the README's table: title, region, metric, task, digits."""
 
 
 def read_stored(folder: Path) -> RunData:
@@ -62,142 +69,144 @@ class StoredResults:
 
     def __init__(self, root: Path):
         self.root, self.gallery = root, root / "reports" / "gallery"
-        self.suite = self.gallery / "suite"
         self.run = cache(read_stored)
         self.read = cache(lambda *folders: RunSet.joined(tuple(map(self.run, folders))))
-        self.choices = cache(
-            lambda *folders: choice_effects(self.read(*folders).only(stored_blocks.COMPARED))
-        )
+        self.curve = cache(lambda over: read_curve([*map(self.run, self.runs("curves", over))], over))
 
-    def blocks(self) -> dict[str, str]:
-        """Every block by its name."""
-        folders = suite_runs(self.suite)
+    def runs(self, *place: str) -> list[Path]:
+        """Folders of the stored runs of one kind."""
+        return suite_runs(self.gallery.joinpath(*place[:-1]), place[-1])
+
+    @property
+    def suite(self) -> RunSet:
+        """The runs of the suite."""
+        return self.read(*self.runs("suite", "run"))
+
+    def blocks(self) -> dict[tuple[str, str], str]:
+        """Every block by its page and name."""
+        demo, profiles, faces = (self.read(self.gallery / name) for name in ("", "profiles", "faces"))
+        folders = self.runs("further")
+        same = self.read(*folders, *(self.gallery / "suite" / "run" / run.name for run in folders))
+        further, new = same.only(same.ranked).shared.by_camera, self.run(folders[0]).methods
+        beside = f"{main_table(further)}\n\n{differences(further, new, REFERENCE)}"
+        columns = Columns(digits=("psnr=1", "ssim=3", "lpips=3", "fps=0"))
+        printed = to_text(table_of(demo, columns=replace(columns, names=(NOVEL, "psnr", "ssim", "lpips"))))
+        lines = [f"{OURS}+{name}" for name in get("methods", OURS).ablations]
         return {
-            "demo": self.demo(),
-            "suite": self.readme(),
-            "protocols": self.worth_of_choices(*folders),
-            "drops": stored_blocks.drops(self.read(*folders)),
-            "ablations": stored_blocks.ablations(self.read(*folders)),
-            "profiles": self.worth_of_choices(self.gallery / "profiles"),
-            "faces": to_markdown(table_of(self.read(self.gallery / "faces"))).strip(),
-            "further": self.further(),
-            **{f"curves-{over}": stored_blocks.curve(self.curve(over)) for over in stored_blocks.UNITS},
+            ("README.md", "demo"): "```text\n{}\n```".format(printed.partition("\n\n")[0]),
+            ("README.md", "suite"): main_table(self.ranked),
+            ("README.md", "findings"): findings(self.suite, self.curve("seconds")),
+            (f"{DOCS}/results.md", "demo"): to_markdown(table_of(demo, columns=columns)).strip(),
+            (f"{DOCS}/results.md", "differences"): differences(self.suite, BESIDE, REFERENCE),
+            (f"{DOCS}/results.md", "curves-seconds"): curve_table(self.curve("seconds"), 1),
+            (f"{DOCS}/results.md", "curves-pictures"): curve_table(self.curve("pictures"), 2),
+            (f"{DOCS}/protocols.md", "protocols"): choices(self.suite),
+            (f"{DOCS}/protocols.md", "profiles"): choices(profiles),
+            (f"{DOCS}/metrics.md", "faces"): to_markdown(table_of(faces)).strip(),
+            (f"{DOCS}/methods/ours.md", "ablations"): differences(self.suite, lines, OURS),
+            (f"{DOCS}/methods/rgbavatar.md", "further"): beside,
         }
 
-    def curve(self, over: str):
-        """The stored curve over a quantity."""
-        return read_curve([*map(self.run, suite_runs(self.gallery / "curves", over))], over)
+    @property
+    def ranked(self) -> RunSet:
+        """The suite's methods, without baselines and conditions, with self-reenactment by camera."""
+        return self.suite.only(self.suite.ranked).shared.by_camera
 
     def write(self) -> None:
-        """Write every block into its page, and the tables and means of the suite into their files."""
-        for name, block in self.blocks().items():
-            page = self.root / PAGES[name]
-            write_text(page, page.read_text(encoding="utf-8").replace(block_of(page, name), block))
-        write_text(self.suite / "results.md", self.results())
+        """Write every block into its page, and all tables and means of the suite into their files."""
+        for (name, block), text in self.blocks().items():
+            page = self.root / name
+            write_text(page, page.read_text(encoding="utf-8").replace(block_of(page, block), text))
+        write_text(self.gallery / "suite" / "results.md", self.results())
         write_json(self.root / "reports" / "measured.json", self.measured())
 
     def results(self) -> str:
         """All tables of the suite."""
-        return suite_report(self.suite, "ours", lambda folders: self.read(*folders))
+        return suite_report(self.gallery / "suite", OURS, lambda folders: self.read(*folders))
 
     def measured(self) -> dict[str, object]:
-        """Means of the suite."""
-        return stored_blocks.measured(self.read(*suite_runs(self.suite)))
+        """Means of the suite, as `MeasuredFigures` has them; over all cameras, as papers print them."""
+        runs = self.suite
+        metrics = [spec for spec in runs.metrics if "comparison" in spec.tables]
+        table = build_table(runs.rows, metrics, runs.ranked, runs.tasks, protocol_ids={})
+        names = [f"{column.task}/{column.metric}".lstrip("/") for column in table.columns]
+        ((_, rows),) = table.groups
+        methods = {row.method: dict(zip(names, (cell.text for cell in row.cells))) for row in rows}
+        sizes = {found.resolution for run in runs.runs for found in run.manifest.protocols.values()}
+        data = f"{counted(len(runs.rows.subjects), 'synthetic subject')}, {' and '.join(sorted(sizes))}"
+        return {"suite": "suite", "data": data, "methods": methods}
 
-    def demo(self) -> str:
-        """The table of the demo, with the digits that do not depend on the processor, and its cost."""
-        runs, record = self.read(self.gallery), RunFolder(self.gallery).read_manifest()
-        table = to_markdown(table_of(runs, columns=Columns((), ("psnr=1", "ssim=3", "lpips=3", "fps=0"))))
-        minutes = ", ".join(
-            f"{name} {m:.1f}"
-            for name, m in stored_blocks.trainings(runs, "training_time")
-            if (m or 0) >= 0.05
-        )
-        where = f"{record.machine['cores']} cores ({record.machine['processor']})"
-        memory = f"the largest process took {(record.peak_memory_bytes or 0) / 1e9:.1f} GB"
-        return f"{table.strip()}\n\nMinutes of training: {minutes}, on {where}; {memory}."
 
-    def worth_of_choices(self, *runs: Path) -> str:
-        """Effects of evaluation choices on `stored_blocks.COMPARED`."""
-        subjects = counted(len(self.read(*runs).rows.subjects), "subject")
-        return f"`{'` and `'.join(stored_blocks.COMPARED)}`, {subjects} of the suite:\n\n{self.choices(*runs)[0]}"
+def main_table(runs: RunSet) -> str:
+    """Means of the methods, the best face first, the best value of each column bold."""
+    parts = {region: runs.of(FrameSelection(region)).rows for region in (FULL, FACE)}
+    cells = {
+        name: [f"{summarise(parts[r], name, metric, task).value:.{n}f}" for _, r, metric, task, n in COLUMNS]
+        for name in runs.methods
+    }
+    titles = [title for title, *_ in COLUMNS]
+    best = [(max if "↑" in t else min)(own, key=float) for t, own in zip(titles, zip(*cells.values()))]
+    lines = [["Method", *titles], ["---", *["--:"] * len(titles)]]
+    for name in sorted(cells, key=lambda name: -float(cells[name][0])):
+        lines.append([f"`{name}`", *(f"**{v}**" if v == top else v for v, top in zip(cells[name], best))])
+    how = f"{runs.image_size} pixels, times on {runs.machine} beside other programs"
+    return f"{pipe_table(lines)}\n\nMeans over {len(runs.rows.subjects)} subjects, the best in bold; images of {how}."
 
-    def change_by_choices(self) -> str:
-        """The range of the change of PSNR of `stored_blocks.COMPARED` by any single choice of an evaluation."""
-        found = self.choices(*suite_runs(self.suite))[1]
-        keys = [
-            f"{method} {task} psnr"
-            for method in stored_blocks.COMPARED
-            for task in ("novel_view", "self_reenactment")
-        ]
-        others = [(own, choice) for choice, own in found.items() if choice != USUAL]
-        changes = [(own[k] - found[USUAL][k], choice) for own, choice in others for k in keys if k in own]
-        ends = " to ".join(f"{change:+.1f} dB ({choice})" for change, choice in (min(changes), max(changes)))
-        page = PAGES["protocols"]
-        return f"Other evaluation choices change the mean PSNR of these avatars by {ends}: [all choices]({page})."
 
-    def further(self) -> str:
-        """Methods that are no part of the suite, beside those of the suite on the same subjects."""
-        further = suite_runs(self.gallery, "further")
-        same = [run for run in suite_runs(self.suite) if run.name in {each.name for each in further}]
-        runs = self.read(*further, *same)
-        runs = runs.only([*runs.ranked]).shared.by_camera
-        methods = dict.fromkeys(r.name for run in further for r in RunFolder(run).read_manifest().methods)
-        columns = Columns(("psnr", "lpips", "storage", "training_processor", "fps_one_thread"))
-        table = to_markdown(table_of(runs, columns=columns)).strip()
-        differences = stored_blocks.differences(runs, [(method, "ga") for method in methods])
-        return f"{table}\n\nDifferences, means over subjects and 95 % intervals:\n\n{differences}"
+def findings(suite: RunSet, curve: CurveData) -> str:
+    """Three sentences on the suite's results."""
+    trainings = [summarise(suite.rows, name, "training_processor", "").value for name in suite.ranked]
+    behind = difference(suite, REFERENCE, OURS, NOVEL, FACE)
+    without = difference(suite, f"{OURS}+no-lines", OURS, NOVEL, FACE)
+    values = {(point.method, point.budget.seconds): point.values["psnr_timesteps"] for point in curve.means}
+    early, late = (values[REFERENCE, limit] - values[OURS, limit] for limit in (30, 120))
+    return f"""\
+- In the face at the unseen camera `{OURS}` is {behind.difference:.1f} dB behind `{REFERENCE}` (95 % interval {behind.low:.1f} to \
+{behind.high:.1f} dB, {behind.subjects} subjects), with about {fmean(trainings):.0f} processor seconds of training.
+- The feature lines of `{OURS}`, the main idea of its paper, are inactive in these runs: opacities hardly change with the expression, and \
+without lines the face changes by {without.difference:+.2f} dB ({without.low:+.2f} to {without.high:+.2f}, {without.subjects} subjects).
+- The differences depend on the training time: on held-out timesteps `{OURS}` is {early:.1f} dB behind `{REFERENCE}` after 30 s, and \
+{late:.1f} dB after 120 s ({len(curve.subjects)} subjects, whole frames)."""
 
-    def readme(self) -> str:
-        """The results of the suite, with a link to all tables."""
-        folders, seeds = suite_runs(self.suite), suite_runs(self.suite, plan.SEEDS_RUN)
-        runs = self.read(*folders)
-        subjects = runs.rows.subjects_of(runs.methods)
-        # Conditions with fewer subjects would reduce the subjects of the table of all methods.
-        everybody = runs.only([*runs.ranked]).shared.rows.subjects
-        shown = runs.only([*runs.ranked, *(name for name in CHANGED if subjects[name] >= everybody)]).shared
-        columns = Columns(("psnr", "lpips", "storage", "fps_one_thread"))
-        made = synthetic_settings(runs.runs[0].manifest.clips[0])
-        repeated = [run for run in folders if run.name in {seed.name for seed in seeds}]
-        variance = stored_blocks.variance(self.read(*repeated, *seeds))
-        speeds, costs = stored_blocks.speeds(shown), stored_blocks.costs(runs, self.read(*seeds))
-        return f"""{to_markdown(table_of(shown, columns=columns)).strip()}
 
-Primary endpoints:
+def difference(runs: RunSet, first: str, second: str, task: str, region: str = FULL) -> PairedComparison:
+    """PSNR of the first method minus that of the second, on the subjects that both have."""
+    pair = (first, second)
+    rows = runs.only(pair).shared.by_camera.of(FrameSelection(region)).rows
+    return compare(rows, [pair], task=task, metric="psnr", higher_is_better=True)[0]
 
-{primary_table(shown)} {variance}
 
-Other differences (exploratory), mean over subjects and 95 % interval:
+def differences(runs: RunSet, methods: Sequence[str], reference: str) -> str:
+    """Differences of the methods that the runs have from another, in whole frames and in the face."""
+    columns = [*product(runs.by_camera.tasks, (FULL, FACE))]
+    titles = [f"{TASK_TITLES[task]}{', face' * (region == FACE)}" for task, region in columns]
+    lines = [
+        [f"PSNR minus that of `{reference}`, dB", *titles, "subjects"],
+        ["---", *["--:"] * (1 + len(titles))],
+    ]
+    for name in (name for name in methods if name in runs.methods):
+        found = [difference(runs, name, reference, *column) for column in columns]
+        lines.append([f"`{name}`", *(each.text(2) for each in found), str(found[0].subjects)])
+    return pipe_table(lines)
 
-{stored_blocks.differences(shown.by_camera, BESIDE)}
 
-{speeds} {self.change_by_choices()} SSIM, baselines, tables by region and by part of the sequence FREE, and all other \
-comparisons with tests are in [the results](reports/gallery/suite/results.md).
+def choices(runs: RunSet) -> str:
+    """Effects of evaluation choices on two methods."""
+    subjects = counted(len(runs.rows.subjects), "subject")
+    return f"`{OURS}` and `{REFERENCE}`, {subjects} of the suite:\n\n{choice_effects(runs.only([OURS, REFERENCE]))[0]}"
 
-The captures are of edition {made.get("edition", 1)}, made with seed {made["seed"]} and the options `headbench run suite \
-{" ".join(self.options())}`. {costs}"""
 
-    def options(self) -> tuple[str, ...]:
-        """Options of ``headbench run suite`` that make the captures, as the runs record them."""
-        runs = [RunFolder(run).read_manifest() for run in suite_runs(self.suite)]
-        given = {"tracker": "per-frame", **synthetic_settings(runs[0].clips[0])}
-        given["size"] = "x".join(map(str, given["size"]))
-        given["large"] = len(suite_runs(self.suite, plan.LARGE_RUN))
-        names = (
-            "performance",
-            "tracker",
-            "tracking_error",
-            "cameras",
-            "timesteps",
-            "size",
-            "subjects",
-            "large",
-        )
-        words = [word for name in names for word in (f"--{name.replace('_', '-')}", str(given[name]))]
-        for option, condition in (("--tracked", plan.TRACKED), ("--equal-iterations", plan.EQUAL)):
-            named = [method.name for run in runs for method in run.methods if method.condition == condition]
-            words += [option, *(dict.fromkeys(named) or [plan.NONE])]
-        return tuple(words)
+def curve_table(curve: CurveData, place: int) -> str:
+    """PSNR of both kinds of held-out frames by method and quantity, size of the largest avatar, and the best methods."""
+    kinds = [HELD_OUT[task] for task in curve.tasks]
+    amounts = sorted({point.place[place] for point in curve.means})
+    lines = [[curve.over, *(f"{each:g}" for each in amounts), "MB"], ["---"] * (2 + len(amounts))]
+    for method, points in groupby(curve.means, key=lambda point: point.method):
+        values = [point.values for point in points]
+        cells = [" / ".join(f"{own[f'psnr_{kind}']:.2f}" for kind in kinds) for own in values]
+        lines.append([f"`{method}`", *cells, f"{max(own['storage'] for own in values):.1f}"])
+    head = f"PSNR in dB, held-out {' / '.join(kinds)}, means over subjects {', '.join(curve.subjects)}:"
+    return f"{head}\n\n{pipe_table(lines)}\n\n{leaders_text(curve)}"
 
 
 def block_of(page: Path, name: str) -> str:
@@ -224,15 +233,17 @@ def store(run: Path, target: Path) -> None:
 
 
 def main(what: str, out: Path, root: Path) -> None:
-    """Store the runs in a folder and write all blocks."""
+    """Store the runs in a folder, write all blocks, and draw pictures of these runs."""
     stored = StoredResults(root)
     target = stored.gallery if what == "demo" else stored.gallery / what
     several = what in ("suite", "further", "curves")
     for rows in sorted(out.rglob("rows.parquet")) if several else [out / "rows.parquet"]:
         store(rows.parent, target / rows.parent.relative_to(out))
-    for over in stored_blocks.UNITS if what == "curves" else ():
-        write_curve(root / "docs" / "pictures" / f"curve-{over}.png", stored.curve(over))
     stored.write()
+    if what == "curves":
+        readme_pictures.draw_curves(stored.curve, stored.ranked.methods, root / "docs" / "pictures")
+    if what == "suite":
+        readme_pictures.draw_subjects(out, stored.gallery / "subjects.jpg")
 
 
 if __name__ == "__main__":

@@ -232,7 +232,7 @@ def demo(device: str, folder: Path) -> list[Bar]:
         raise RuntimeError(f"headbench demo ended with exit code {code}")
     rows = Rows.read(folder / "rows.parquet")
     found = dict(_means(rows))
-    # The table in the README; at small sizes there is none, and this one is compared with itself.
+    # The stored demo, whose table the README has; at small sizes there is none, and this one is compared with itself.
     stored = found if device == "cpu" else dict(_means(Rows.read(ROOT / "reports/gallery/rows.parquet")))
     bars = [
         Bar(f"demo, {method}, {task}: dB from the CPU's table", abs(value - stored[method, task]), 0.3)

@@ -12,7 +12,7 @@ from headbench.bench import cli, contracts, errors, specs
 from headbench.bench.conformance import command
 from headbench.bench.engine import captures
 
-PLUGINS = ("grey:SPEC", "outside_reader:SPEC", "mae:MAE") + tuple(
+PLUGINS = ("camera_mean:SPEC", "outside_reader:SPEC", "mae:MAE") + tuple(
     f"outside_metric:{name}" for name in ("ERROR", "JUMP", "FILES", "HOURS")
 )
 
@@ -20,7 +20,7 @@ PLUGINS = ("grey:SPEC", "outside_reader:SPEC", "mae:MAE") + tuple(
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_plugins_written_outside_conform(outside, npz_capture, capsys, plugin):
     read_by = ["--reader", "outside_reader:SPEC", "--data", str(npz_capture)]
-    data = {"grey:SPEC": read_by, "outside_reader:SPEC": read_by[2:]}.get(plugin, [])
+    data = {"camera_mean:SPEC": read_by, "outside_reader:SPEC": read_by[2:]}.get(plugin, [])
     assert cli.main(["doctor", "check", plugin, *data]) == 0
     assert "keeps its contract" in capsys.readouterr().out
 
@@ -48,24 +48,33 @@ def test_an_experiment_written_outside_runs_its_conditions(outside, npz_capture,
 
 
 @pytest.fixture
-def grey(npz_capture):
-    """The words that check the README's method."""
-    return ["doctor", "check", "grey:SPEC", "--reader", "outside_reader:SPEC", "--data", str(npz_capture)]
+def check(npz_capture):
+    """The words that check the tutorial's method."""
+    return [
+        "doctor",
+        "check",
+        "camera_mean:SPEC",
+        "--reader",
+        "outside_reader:SPEC",
+        "--data",
+        str(npz_capture),
+    ]
 
 
-def test_breaches_are_listed_and_the_exit_code_is_one(outside, grey, capsys, monkeypatch):
-    monkeypatch.setattr("grey.GreyAvatar.files", lambda self: [])
-    assert cli.main(grey) == 1
+def test_breaches_are_listed_and_the_exit_code_is_one(outside, check, capsys, monkeypatch):
+    monkeypatch.setattr("camera_mean.CameraMeanAvatar.files", lambda self: [])
+    assert cli.main(check) == 1
     assert "1 breach of the contract of a method\n- files() names no file" in capsys.readouterr().out
-    assert cli.main([*grey, "--json"]) == 1
+    assert cli.main([*check, "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["breaches"] == ["files() names no file"]
 
 
-def test_what_a_plugin_raises_is_a_breach_with_its_line(outside, grey, capsys):
-    (outside / "grey.py").write_text((outside / "grey.py").read_text().replace("progress(1, 1)", "1 / 0"))
-    assert cli.main([*grey, "--set", "level=high"]) == 2  # not of its type
-    assert cli.main(grey) == 1
-    assert "ZeroDivisionError: division by zero (grey.py, line" in capsys.readouterr().out
+def test_what_a_plugin_raises_is_a_breach_with_its_line(outside, check, capsys):
+    method = outside / "camera_mean.py"
+    method.write_text(method.read_text().replace("progress(done, len(cameras))", "1 / 0"))
+    assert cli.main([*check, "--set", "timesteps=many"]) == 2  # not of its type
+    assert cli.main(check) == 1
+    assert "ZeroDivisionError: division by zero (camera_mean.py, line" in capsys.readouterr().out
 
 
 def test_without_data_a_method_is_tried_on_a_synthetic_capture(monkeypatch):

@@ -18,8 +18,6 @@ from headbench.datasets.synthetic.plan import SyntheticSettings
 from headbench.methods.ours.spec import ADDITIONS, OURS, OURS_PLUS
 from headbench.reports.suite.suite import suite_runs
 
-from ...docs_ext import stored_results
-
 SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16")
 
 
@@ -76,11 +74,12 @@ def asked(monkeypatch, tmp_path):
     return plan
 
 
-def test_the_stored_suite_can_be_made_again_by_its_options(asked):
-    results = stored_results.StoredResults(Path(__file__).parents[3])
-    first, *_ = suite_runs(results.suite)
+def test_the_page_has_the_command_of_the_stored_suite(asked):
+    root = Path(__file__).parents[3]
+    first, *_ = suite_runs(root / "reports" / "gallery" / "suite")
     stored = RunFolder(first).read_manifest()
-    (capture, config), *_ = asked(*results.options())
+    page = (root / "docs" / "explanation" / "suite.md").read_text("utf-8")
+    (capture, config), *_ = asked(*re.search(r"^headbench run suite (.+)$", page, re.MULTILINE)[1].split())
     names = ("subjects", "cameras", "timesteps", "size", "seed", "performance", "tracking_error", "tracker")
     samples = default_samples(*capture["size"])
     planned = SyntheticSettings(
