@@ -10,11 +10,28 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.tracking.fit import Fitter
+from headbench.datasets.tracking.images import FrameStack
 from headbench.datasets.tracking.landmarks import known_rig_landmarks, spread_vertices
 from headbench.datasets.tracking.rig import PoseColumns
 from headbench.datasets.tracking.track import track
 from headbench.datasets.tracking.views import Views
 from headbench.datasets.tracking_errors import mesh_errors
+
+
+def ramp(width, height, along, across):
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.repeat((10 + along * x + across * y)[..., None], 3, axis=2).astype(np.uint8)
+
+
+def test_values_and_gradients_of_ramps():
+    stack = FrameStack([ramp(20, 30, 2, 4), ramp(40, 20, 4, 2)])
+    stack.filter(0.0)
+    frames, places = np.array([0, 1, 1]), np.array([[7.25, 11.5], [30.0, 9.75], [3.5, 4.5]])
+    values, gradients = stack.sample(frames, places)
+    slopes = np.array([[2, 4], [4, 2], [4, 2]])
+    wanted = 10 + (slopes * places).sum(axis=1)
+    np.testing.assert_allclose(values, np.repeat(wanted[:, None], 3, axis=1) / 255, atol=5e-3)
+    np.testing.assert_allclose(gradients, np.repeat(slopes[:, None], 3, axis=1) / 255, atol=2e-3)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """The CPU shim: its rasteriser against the float64 reference and a closed form, and what it does to a script."""
 
 import json
+import math
 import subprocess
 import sys
 
@@ -8,11 +9,251 @@ import numpy as np
 import pytest
 import torch
 
+from headbench.datasets.head.rotations import axis_angle_to_matrix
+from headbench.methods.insta.warp import squared_distances
 from headbench.methods.official.method import LAUNCHER
+from headbench.methods.official.shim import blendshapes as shim
+from headbench.methods.official.shim import meshes
 from headbench.methods.official.shim.cpu import mean_square_distances
+from headbench.methods.official.shim.meshes import SMALLEST_AREA, Mesh, load_obj, rasterize_meshes
 from headbench.methods.official.shim.rasterizer import GaussianRasterizationSettings, GaussianRasterizer
-from headbench.methods.ops.harmonics import harmonic_colors
+from headbench.methods.ops.harmonics import harmonic_colors, sh_basis
+from headbench.methods.shared.surface_points import texel_points
 from headbench.methods.splats import rasterize
+
+
+def draw(*shape, seed=0, dtype=torch.float64):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def test_turned_harmonics_have_the_values_of_before():
+    rotations = axis_angle_to_matrix(draw(5, 3))
+    coefficients = draw(5, 16, 3, seed=1).requires_grad_()
+    turned = shim.rotate_harmonics(rotations, coefficients)
+    directions = torch.nn.functional.normalize(draw(5, 3, seed=2), dim=1)
+    seen = torch.einsum("pk,pkc->pc", sh_basis(torch.einsum("pij,pj->pi", rotations, directions), 3), turned)
+    before = torch.einsum("pk,pkc->pc", sh_basis(directions, 3), coefficients)
+    assert torch.allclose(seen, before, atol=1e-12)
+    # Turning keeps each degree's length, so the gradient of half the squared length is the coefficients.
+    (0.5 * turned.square().sum()).backward()
+    assert torch.allclose(coefficients.grad, coefficients, atol=1e-12)
+    for degree in range(4):
+        part = slice(degree**2, (degree + 1) ** 2)
+        assert torch.allclose(turned[:, part].norm(dim=1), coefficients[:, part].norm(dim=1), atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 3), (4, 16, 3)])
+@pytest.mark.parametrize(("initial", "mask"), [(True, True), (False, True), (True, False), (False, False)])
+def test_blended_expressions_and_their_gradients(shape, initial, mask):
+    points, count = shape[0], 7
+    mean, basis = draw(*shape).requires_grad_(), draw(*shape, count, seed=1).requires_grad_()
+    coefficients = draw(count, seed=2)
+    added = draw(*shape, count, seed=3) if initial else None
+    weights = draw(points, count, seed=4).abs() if mask else None
+    found = shim.composite_blendshape(mean, basis, coefficients, added, weights)
+    spread = (weights if mask else torch.ones(points, count)).reshape(points, *[1] * (len(shape) - 1), count)
+    expected = mean + (((added if initial else 0.0) + basis * spread) * coefficients).sum(-1)
+    assert torch.allclose(found, expected)
+    outer = draw(*shape, seed=5)
+    gradients = [torch.autograd.grad((value * outer).sum(), (mean, basis)) for value in (found, expected)]
+    for one, other in zip(*gradients):
+        assert torch.allclose(one, other)
+
+
+def test_inverses_and_their_gradients():
+    matrices = (torch.eye(3, dtype=torch.float64) + 0.2 * draw(6, 3, 3)).requires_grad_()
+    found, expected = shim.inverse(matrices), torch.linalg.inv(matrices)
+    assert torch.allclose(found, expected)
+    outer = draw(6, 3, 3, seed=1)
+    gradients = [torch.autograd.grad((value * outer).sum(), matrices)[0] for value in (found, expected)]
+    assert torch.allclose(*gradients)
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.01])
+def test_adam_is_torch_s(decay):
+    known = torch.nn.Parameter(draw(20))
+    own, mean, square = known.detach().clone(), torch.zeros(20).double(), torch.zeros(20).double()
+    optimiser = torch.optim.Adam([known], lr=0.01, betas=(0.9, 0.999), eps=1e-15, weight_decay=decay)
+    for step in range(1, 6):
+        known.grad = draw(20, seed=step)
+        optimiser.step()
+        corrections = 1 - 0.9**step, math.sqrt(1 - 0.999**step)
+        rate = 0.01 / corrections[0]
+        shim.adam_update(0.9, 0.999, *corrections, rate, 1e-15, decay, own, known.grad.clone(), mean, square)
+    assert torch.allclose(own, known.detach(), rtol=1e-12)
+
+
+@pytest.fixture
+def octahedron():
+    vertices = 0.05 * torch.cat([torch.eye(3), -torch.eye(3)])
+    faces = [[x, y, z] for x in (0, 3) for y in (1, 4) for z in (2, 5)]
+    return vertices, torch.tensor(faces, dtype=torch.int32)
+
+
+def test_nearest_triangles_are_those_of_brute_force(octahedron):
+    vertices, faces = octahedron
+    points = 0.05 * torch.nn.functional.normalize(draw(200, 3, dtype=torch.float32), dim=1)
+    found = shim.nearest_triangles(vertices, faces, points, 16)
+    near = (points[:, None] - vertices).norm(dim=2).min(1).values < shim.FAR
+    assert 20 < near.sum() < 180
+    squared = squared_distances(points, vertices[faces.long()])
+    own = squared.gather(1, found.long()[:, None])[:, 0]
+    assert torch.allclose(own[near], squared.min(1).values[near], atol=1e-9)
+    # Far away it is a triangle of the nearest vertex.
+    corner = (points[:, None] - vertices).norm(dim=2).argmin(1)
+    assert (faces.long()[found.long()] == corner[:, None]).any(1)[~near].all()
+
+
+def test_features_are_interpolated_on_the_nearest_triangle(octahedron):
+    vertices, faces = octahedron
+    weights = torch.tensor([[0.85, 0.1, 0.05], [0.8, 0.05, 0.15]])
+    triangles = torch.tensor([1, 6])
+    points = (weights[:, :, None] * vertices[faces.long()[triangles]]).sum(1)
+    outwards = 1 + 1e-3 * torch.ones(2, 1)
+    features = draw(6, 4, dtype=torch.float32)
+    found = shim.nearest_features(vertices, features, faces, points * outwards, 16)
+    expected = (weights[:, :, None] * features[faces.long()[triangles]]).sum(1)
+    assert torch.allclose(found, expected, atol=2e-3)
+
+
+def test_ids_around_a_point_and_their_shares():
+    grid = torch.arange(2 * 3 * 4).view(2, 3, 4)
+    # Nodes lie at -1 and 1 of each axis and evenly between: x has 4 of them, y 3, z 2.
+    points = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0], [0.0, 0.5, -0.5]])
+    ids, shares = shim.ids_and_weights(points, grid, True)
+    assert shares.sum(1).tolist() == pytest.approx([1, 1, 1])
+    blended = (ids * shares).sum(1)
+    position = (points * 0.5 + 0.5) * torch.tensor([3.0, 2.0, 1.0])
+    assert torch.allclose(blended, position @ torch.tensor([1.0, 4.0, 12.0]))
+    assert ids[0, 0] == 0
+    assert ids[1].tolist() == [23] * 8
+
+
+def test_six_numbers_are_the_first_rows_of_a_rotation():
+    rotations = axis_angle_to_matrix(draw(4, 3))
+    six = meshes.matrix_to_rotation_6d(rotations)
+    assert torch.allclose(six[:, 3:], rotations[:, 1])
+    stretched = torch.cat([2 * six[:, :3], six[:, 3:] + 0.3 * six[:, :3]], dim=1)
+    assert torch.allclose(meshes.rotation_6d_to_matrix(stretched), rotations)
+
+
+def test_meshes_are_read_and_sampled(tmp_path):
+    (tmp_path / "a.obj").write_text("# a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n")
+    vertices, faces, _ = meshes.load_obj(str(tmp_path / "a.obj"))
+    assert vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert faces.verts_idx.tolist() == [[0, 1, 2]]
+    triangles, barycentric = shim.sample_mesh_poisson_disk(vertices.numpy(), faces.verts_idx.numpy(), 100)
+    assert 80 < len(triangles) < 120
+    assert barycentric.dtype == np.float32
+    assert barycentric.sum(1) == pytest.approx(1)
+
+
+SIZE = 24
+
+
+def mesh(vertices, faces):
+    return Mesh(torch.tensor(vertices)[None].float(), torch.tensor(faces)[None])
+
+
+def brute_force(vertices, faces, size):
+    """Triangle, z and barycentric coordinates by pixel: every triangle in every pixel, by solving for the weights."""
+    found = {}
+    for row in range(size):
+        for column in range(size):
+            # To the right and downwards, normalised device coordinates go from 1 to -1.
+            point = [1 - (2 * column + 1) / size, 1 - (2 * row + 1) / size]
+            hits = []
+            for index, corners in enumerate(vertices[faces]):
+                system = np.vstack([corners[:, :2].T, np.ones(3)])
+                if abs(np.linalg.det(system)) <= SMALLEST_AREA:
+                    continue
+                weights = np.linalg.solve(system, [*point, 1.0])
+                depth = float(weights @ corners[:, 2])
+                if weights.min() > 0 and depth >= 0:
+                    hits.append((depth, index, weights))
+            if hits:
+                found[row, column] = min(hits, key=lambda hit: hit[:2])
+    return found
+
+
+def test_pixels_have_the_triangle_of_brute_force():
+    random = np.random.default_rng(0)
+    vertices = random.uniform(-1.2, 1.2, (30, 3)).astype(np.float32).astype(np.float64)
+    vertices[:, 2] += 0.9  # some are behind z = 0
+    faces = random.integers(0, 30, (25, 3))
+    faces[3] = faces[7]  # the first of equal depth
+    faces[4, 1] = faces[4, 0]  # no area
+    triangles, z, barycentric, _ = rasterize_meshes(mesh(vertices, faces), image_size=SIZE)
+    assert triangles.shape == z.shape == (1, SIZE, SIZE, 1)
+    expected = brute_force(vertices, faces, SIZE)
+    assert 100 < len(expected) < SIZE**2
+    for row in range(SIZE):
+        for column in range(SIZE):
+            hit = expected.get((row, column))
+            assert int(triangles[0, row, column, 0]) == (-1 if hit is None else hit[1])
+            if hit is not None:
+                assert float(z[0, row, column, 0]) == pytest.approx(hit[0], abs=1e-6)
+                assert barycentric[0, row, column, 0].numpy() == pytest.approx(hit[2], abs=1e-6)
+
+
+def test_the_upper_left_is_the_first_row_and_column():
+    triangle = [[0.99, 0.99, 1.0], [0.4, 0.99, 1.0], [0.99, 0.4, 1.0]]
+    triangles = rasterize_meshes(mesh(triangle, [[0, 1, 2]]), image_size=4)[0][0, :, :, 0]
+    assert (triangles == 0).nonzero().tolist() == [[0, 0]]
+    turned = rasterize_meshes(mesh(triangle, [[2, 1, 0]]), image_size=4)[0][0, :, :, 0]
+    assert torch.equal(triangles, turned)
+
+
+def test_texels_of_a_chart_are_those_of_the_native_method():
+    """A grid of cells, each of two triangles, a third of which have no place in the chart."""
+    random, side = np.random.default_rng(1), 7
+    lines = np.linspace(0.03, 0.96, side + 1)
+    places = np.stack(np.meshgrid(lines, lines), axis=-1) + random.uniform(
+        -0.03, 0.03, (side + 1, side + 1, 2)
+    )
+    corner = np.arange((side + 1) ** 2).reshape(side + 1, side + 1)
+    a, b, c, d = (corner[i : i + side, j : j + side].ravel() for i in (0, 1) for j in (0, 1))
+    faces = np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c])])
+    uv = places.reshape(-1, 2)[faces].astype(np.float32).astype(np.float64)
+    kept = np.flatnonzero(random.random(len(faces)) > 1 / 3)
+    edges = uv[kept, 1:] - uv[kept, :1]
+    area = 0.5 * np.abs(np.linalg.det(edges)).sum()
+    resolution = 40
+    points = texel_points(uv, kept, round(area * resolution**2))
+
+    # As the authors' code calls it: coordinates run from -1 to 1, and both axes are turned.
+    ndc = 1 - 2 * uv[kept].reshape(-1, 2)
+    ndc[:, 1] *= -1
+    vertices = np.column_stack([ndc, np.ones(len(ndc))])
+    corners = np.arange(3 * len(kept)).reshape(-1, 3)
+    triangles, _, barycentric, _ = rasterize_meshes(mesh(vertices, corners), image_size=resolution)
+    hit = triangles[0, :, :, 0].numpy()
+    rows, columns = np.nonzero(hit >= 0)
+    assert len(rows) == len(points.triangles) > 300
+    theirs = {
+        (row, column): (kept[hit[row, column]], barycentric[0, row, column, 0].numpy())
+        for row, column in zip(rows, columns)
+    }
+    at = (points.barycentric[:, :, None] * uv[points.triangles]).sum(1) * resolution
+    for triangle, weights, (x, y) in zip(*points, at):
+        found, theirs_weights = theirs[resolution - 1 - int(y), int(x)]
+        assert found == triangle
+        assert theirs_weights == pytest.approx(weights, abs=2e-4)  # vertices are float32
+
+
+def test_objects_with_and_without_a_chart_are_read(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text(
+        "# a\no head\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0.5 0.25\nvt 1 0\nvn 0 0 1\nf 1/2/1 2/1/1 3/1/1\nf 3 2 1\nf 1//1 2//1 3//1\n"
+    )
+    vertices, faces, extra = load_obj(str(path), load_textures=False)
+    assert vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert faces.verts_idx.tolist() == [[0, 1, 2], [2, 1, 0], [0, 1, 2]]
+    assert faces.textures_idx.tolist() == [[1, 0, 0], [-1] * 3, [-1] * 3]
+    assert extra.verts_uvs.tolist() == [[0.5, 0.25], [1, 0]]
+    path.write_text("v 0 0 0\nf 1 1 1\n")
+    assert load_obj(str(path))[2].verts_uvs is None
+
 
 WIDTH, HEIGHT, FOCAL = 40, 24, (50.0, 44.0)
 

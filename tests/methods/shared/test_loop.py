@@ -4,12 +4,36 @@ import pytest
 import torch
 from torch import nn
 
-from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.contracts import Budget, PreparedMethod, no_progress
 from headbench.bench.errors import InputError
+from headbench.methods.ga.method import GA
 from headbench.methods.shared import loop
+from headbench.methods.shared import method as shared
 from headbench.methods.shared.loop import CHECKPOINT, Fit, train
+from headbench.methods.shared.losses import position_penalty, scale_penalty
 from headbench.methods.shared.optimisation import Optimiser
 from headbench.methods.shared.threads import threads, torch_threads
+
+
+def test_optimisers_are_loaded_before_a_training_and_not_to_draw(monkeypatch):
+    loaded = []
+    monkeypatch.setattr(shared, "load_optimisers", lambda: loaded.append(True))
+    method = GA()
+    method._use("cpu")
+    assert loaded == []
+    assert isinstance(method, PreparedMethod)  # prepared before the clock of a training starts
+    method.prepare("cpu")
+    assert loaded == [True]
+
+
+def test_penalties_have_zero_gradient_where_nothing_exceeds():
+    means = torch.zeros(4, 3, requires_grad=True)
+    log_scales = torch.full((4, 3), -5.0, requires_grad=True)
+    visible = torch.ones(4, dtype=torch.bool)
+    (position_penalty(means, visible, 1.0) + scale_penalty(log_scales, visible, 0.6)).backward()
+    assert (means.grad == 0).all()
+    assert (log_scales.grad == 0).all()
+    assert float(position_penalty(means.detach() + 9, ~visible, 1.0)) == 0  # nothing visible costs nothing
 
 
 class Drift:

@@ -12,8 +12,27 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from headbench.datasets.steps.exclude import read_exclusions, write_exclusions
 from headbench.datasets.steps.tongue.command import DECISIONS_FILE, TongueSettings, tongue
+from headbench.datasets.steps.tongue.evidence import decide, find_evidence
+from headbench.datasets.steps.tongue.mouth import facing_cameras, mouth_atlas, sample_clip
+from headbench.datasets.synthetic.capture import synthesize
 
 from .painted import TONGUE, Moment, geometry, painted_clip
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_synthetic_subject_is_decided_as_labelled(tmp_path):
+    (union,) = synthesize(tmp_path, cameras=2, timesteps=40, size=(96, 136), seed=50, workers=1)
+    clip = read_capture(union)
+    labelled = {key.timestep for key in clip.excluded}
+    atlas = mouth_atlas(clip)
+    cameras = facing_cameras(clip, atlas, 4)
+    colours = sample_clip(clip, atlas, cameras)
+    evidence = find_evidence(colours, atlas)
+    decided = decide(dict.fromkeys(colours.timesteps, ""), evidence, tuple(cameras), None, {})
+    assert labelled
+    assert set(decided.reasons()) == labelled
+
 
 TALK = [Moment({"jaw_open": 0.12 * (t % 4), "head_turn": 0.03 * t}) for t in range(6)]
 FREE = [
