@@ -37,19 +37,8 @@ setup: $(INSTALLED)
 # Exact versions with hashes, nothing resolved and nothing built but headbench itself. Reinstalled when packaging or the
 # kernels change; Python sources are used in place.
 KERNEL := $(shell git ls-files "*CMakeLists.txt" "*.cmake" "*.cpp" "*.h" 2>/dev/null)
-PIP     = $(BIN)/python -m pip --disable-pip-version-check
-LOCKED  = $(PIP) install --quiet --no-deps --require-hashes --only-binary :all:
-$(INSTALLED): pyproject.toml $(wildcard requirements*.txt) __init__.py $(KERNEL)
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and \
-	  f"headbench is locked for Python 3.11 to 3.13, and this is {sys.version.split()[0]}; set PYTHON=")'
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@build=$(TORCH); if [ -z "$$build" ]; then build=cpu; \
-	  $(LOCKED) --dry-run -r requirements-torch-cpu.txt >/dev/null 2>&1 || { build=cuda; \
-	  echo "No index that pip is configured for has PyTorch's CPU build: installing the one with CUDA, several GB."; }; fi; \
-	echo "Installing PyTorch ($$build)" && $(LOCKED) -r requirements-torch-$$build.txt
-	@echo "Installing packages" && $(LOCKED) -r requirements.txt -r requirements-dev.txt
-	@echo "Building headbench" && $(PIP) install --quiet --no-deps --no-build-isolation --editable .
-	@$(PIP) check
+$(INSTALLED): pyproject.toml $(wildcard requirements*.txt) __init__.py .ci/install.py $(KERNEL)
+	@$(PYTHON) .ci/install.py $(VENV) $(TORCH)
 	@touch $@
 
 lock:
