@@ -23,7 +23,7 @@ help:
 	@echo "make test-slow    run the tests marked slow"
 	@echo "make nightly      run what takes too long for every change: the list in .ci/run"
 	@echo "make check   style, types, architecture"
-	@echo "make gpu     does a GPU give the CPU's numbers, and how fast; WHEELS=DIR collects wheels to install without a network"
+	@echo "make gpu     does a GPU give the CPU's numbers, and how fast; WHEELS=DIR collects wheels for a machine without a network"
 	@echo "make gate    compare the numbers of a small demo with tests/demo_baseline.json"
 	@echo "make baseline  write that baseline again, after a change that is meant to move them"
 	@echo "make bench   measure the speed of the splat renderer"
@@ -87,10 +87,12 @@ check: setup
 	$(BIN)/python -m pytest -q tests/test_architecture.py
 	$(BIN)/python -m headbench.reports.papers
 
+# With WHEELS: packages for a bare machine with Python GPU_PYTHON, and nothing else.
+GPU_PYTHON ?= 3.12
 gpu:
-	$(MAKE) gpu-checks TORCH=cuda
+	$(if $(WHEELS),$(PYTHON) tests/gpu/bare.py $(WHEELS) --collect --python $(GPU_PYTHON),$(MAKE) gpu-checks TORCH=cuda)
 gpu-checks: setup
-	$(BIN)/python -m headbench.tests.gpu $(if $(WHEELS),--wheels $(WHEELS))
+	$(BIN)/python -m headbench.tests.gpu
 
 # Seconds of seeded training on a capture that has the same bytes everywhere. Between AVX-512, AVX2 and SSE4 the means of PSNR
 # moved by up to 0.017 dB and those of SSIM by up to 0.00065, between one and two threads not at all; the baseline allows three

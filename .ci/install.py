@@ -106,6 +106,8 @@ class Installer:
     def install(self, *files, options=()):
         """Install the files' packages by uv, or by pip where that fails; whether it succeeded."""
         uv = [self.python, "-m", "uv", "pip", "install", "--python", self.python, *self._locked(files)]
+        if os.environ.get("PYTHONDONTWRITEBYTECODE"):  # every process would compile all it imports
+            uv.append("--compile-bytecode")
         return (self.uv and not self._run([*uv, *options])) or not self._run([*self._pip(*files), *options])
 
     def build(self):
@@ -117,7 +119,9 @@ class Installer:
     def reason(self):
         """Why the last program failed, in a sentence."""
         text = self.log.read_text(errors="replace").rsplit("\n$ ", 1)[-1]
-        cause = next((cause for pattern, cause in CAUSES.items() if re.search(pattern, text, re.I)), "")
+        cause = next(
+            (cause for pattern, cause in CAUSES.items() if re.search(pattern, text, re.IGNORECASE)), ""
+        )
         lines = [line for line in text.splitlines() if line.strip()]
         return f"{cause or lines[-1].strip()} (what was printed is in {self.log})"
 
