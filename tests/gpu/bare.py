@@ -26,8 +26,8 @@ FOLDERS = ("bench", "datasets", "methods", "metrics", "reports", "tests")
 NAMES = (
     "annotated-types", "docstring-parser", "gsplat", "jaxtyping", "joblib", "markdown-it-py", "mdurl",
     "nanobind", "narwhals", "psutil", "pydantic", "pydantic-core", "pygments", "pyyaml", "rich",
-    "safetensors", "scikit-learn", "scipy", "threadpoolctl", "typeguard", "typing-extensions", "typing-
-    inspection", "tyro", "wadler-lindig"
+    "safetensors", "scikit-learn", "scipy", "threadpoolctl", "typeguard", "typing-extensions",
+    "typing-inspection", "tyro", "wadler-lindig"
 )
 # fmt: on
 LIMIT_MB = 55
@@ -76,7 +76,10 @@ def collect(folder, python):
 def shrink(wheel):
     """Write a wheel again without its package's own tests and documents, which are a tenth of all."""
     smaller = wheel.with_suffix(".part")
-    with zipfile.ZipFile(wheel) as whole, zipfile.ZipFile(smaller, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as part:
+    with (
+        zipfile.ZipFile(wheel) as whole,
+        zipfile.ZipFile(smaller, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as part,
+    ):
         for name in whole.namelist():
             if not re.search(r"/(tests?|docs?)/", name):
                 part.writestr(name, whole.read(name))
