@@ -23,7 +23,7 @@ help:
 	@echo "make test-slow    run the tests marked slow"
 	@echo "make nightly      run what takes too long for every change: the list in .ci/run"
 	@echo "make check   style, types, architecture"
-	@echo "make gpu     does a GPU give the CPU's numbers, and how fast; WHEELS=DIR collects wheels to install without a network"
+	@echo "make gpu     does a GPU give the CPU's numbers, and how fast; WHEELS=DIR collects wheels for a machine without a network"
 	@echo "make gate    compare the numbers of a small demo with tests/demo_baseline.json"
 	@echo "make baseline  write that baseline again, after a change that is meant to move them"
 	@echo "make readme  store a new demo, and write its tables into README.md and docs/"
@@ -38,19 +38,8 @@ setup: $(INSTALLED)
 # Exact versions with hashes, nothing resolved and nothing built but headbench itself. Reinstalled when packaging or the
 # kernels change; Python sources are used in place.
 KERNEL := $(shell git ls-files "*CMakeLists.txt" "*.cmake" "*.cpp" "*.h" 2>/dev/null)
-PIP     = $(BIN)/python -m pip --disable-pip-version-check
-LOCKED  = $(PIP) install --quiet --no-deps --require-hashes --only-binary :all:
-$(INSTALLED): pyproject.toml $(wildcard requirements*.txt) __init__.py $(KERNEL)
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and \
-	  f"headbench is locked for Python 3.11 to 3.13, and this is {sys.version.split()[0]}; set PYTHON=")'
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@build=$(TORCH); if [ -z "$$build" ]; then build=cpu; \
-	  $(LOCKED) --dry-run -r requirements-torch-cpu.txt >/dev/null 2>&1 || { build=cuda; \
-	  echo "No index that pip is configured for has PyTorch's CPU build: installing the one with CUDA, several GB."; }; fi; \
-	echo "Installing PyTorch ($$build)" && $(LOCKED) -r requirements-torch-$$build.txt
-	@echo "Installing packages" && $(LOCKED) -r requirements.txt -r requirements-dev.txt
-	@echo "Building headbench" && $(PIP) install --quiet --no-deps --no-build-isolation --editable .
-	@$(PIP) check
+$(INSTALLED): pyproject.toml $(wildcard requirements*.txt) __init__.py .ci/install.py $(KERNEL)
+	@$(PYTHON) .ci/install.py $(VENV) $(TORCH)
 	@touch $@
 
 lock:
@@ -99,10 +88,12 @@ check: setup
 	$(BIN)/python -m pytest -q tests/test_architecture.py
 	$(BIN)/python -m headbench.reports.papers
 
+# With WHEELS: packages for a bare machine with Python GPU_PYTHON, and nothing else.
+GPU_PYTHON ?= 3.12
 gpu:
-	$(MAKE) gpu-checks TORCH=cuda
+	$(if $(WHEELS),$(PYTHON) tests/gpu/bare.py $(WHEELS) --collect --python $(GPU_PYTHON),$(MAKE) gpu-checks TORCH=cuda)
 gpu-checks: setup
-	$(BIN)/python -m headbench.tests.gpu $(if $(WHEELS),--wheels $(WHEELS))
+	$(BIN)/python -m headbench.tests.gpu
 
 # Seconds of seeded training on a capture that has the same bytes everywhere. Between AVX-512, AVX2 and SSE4 the means of PSNR
 # moved by up to 0.017 dB and those of SSIM by up to 0.00065, between one and two threads not at all; the baseline allows three

@@ -1,9 +1,10 @@
 """``make lock``: write exact versions and hashes of everything that the Makefile installs, for Python 3.11 to 3.13 on Linux.
 
-Four requirements files are written beside ``pyproject.toml``, whose open ranges they pin:
+Five requirements files are written beside ``pyproject.toml``, whose open ranges they pin:
 
 - ``requirements.txt``: what headbench needs, without PyTorch;
 - ``requirements-dev.txt``: the extras ``dev`` and ``docs`` and the tools that build the kernels;
+- ``requirements-uv.txt``: the program that installs the others;
 - ``requirements-torch-cuda.txt``: PyTorch as the package index has it, CUDA's libraries, and the extra ``cuda``;
 - ``requirements-torch-cpu.txt``: PyTorch's CPU build. Hashes of builds that no index configured for pip offers are kept
   from the file as it is.
@@ -25,8 +26,8 @@ ROOT = Path(__file__).resolve().parents[1]
 TORCH = "2.13.0"
 PYTHONS = ("3.11", "3.12", "3.13")
 PLATFORMS = ("manylinux_2_28_x86_64", "manylinux_2_28_aarch64")
-BUILDERS = ("cmake>=3.20", "ninja>=1.11")
-"""Programs that scikit-build-core runs. It asks for them itself only where the build is isolated."""
+BUILDERS = ("cmake>=3.20", "ninja>=1.11", "uv>=0.8")
+"""Programs that scikit-build-core runs, which asks for them only where the build is isolated, and uv."""
 
 Pins = dict[str, str]
 """Requirements with their hashes, as a requirements file holds them, by the text up to the first hash."""
@@ -96,7 +97,7 @@ def write(name: str, pins: Pins) -> None:
 
 
 def main() -> None:
-    """Resolve and write all four files; the smaller sets decide the versions of the larger ones."""
+    """Resolve and write all files; the smaller sets decide the versions of the larger ones."""
     build = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]
     plain = resolve((), [], {})
     developer = resolve(("dev", "docs"), [*build, *BUILDERS], plain)
@@ -104,9 +105,11 @@ def main() -> None:
     cuda = re.compile(r"torch==|triton==|nvidia-|cuda-")
     main = {pin: text for pin, text in plain.items() if not cuda.match(pin)}
     write("requirements.txt", main)
+    uv = {pin: text for pin, text in developer.items() if pin.startswith("uv==")}
+    write("requirements-uv.txt", uv)
     write(
         "requirements-dev.txt",
-        {pin: text for pin, text in developer.items() if pin not in main and not cuda.match(pin)},
+        {pin: text for pin, text in developer.items() if pin not in main | uv and not cuda.match(pin)},
     )
     write(
         "requirements-torch-cuda.txt",

@@ -21,7 +21,6 @@ from ..io.provenance import tool
 from ..registry import discover, get, resolve
 from ..specs import MethodSpec, ResolutionRule
 from .config import AVATAR_FOLDER, ResolvedMethod
-from .store import avatar_files
 
 log = logging.getLogger(__name__)
 
@@ -255,5 +254,7 @@ def training_losses(folder: Path) -> list[tuple[int, float]]:
 
 def avatar_digest(folder: Path) -> str:
     """Digest of all files of an avatar; see `avatar_files`."""
+    from .store import avatar_files  # loads pandas, which reading an avatar does without
+
     home = avatar_folder(folder)
     return digest([[path.relative_to(home).as_posix(), digest_file(path)] for path in avatar_files(home)])

@@ -12,20 +12,19 @@
 #include <string>
 #include <vector>
 
-#if defined(HEADBENCH_X86)
-#define HEADBENCH_DECLARE(Table, table)            \
-  namespace avx512 {                               \
-  extern const Table table;                        \
-  }                                                \
-  namespace avx2 {                                 \
-  extern const Table table;                        \
+#define HEADBENCH_DECLARE_SET(Table, table, set) \
+  namespace set {                                \
+  extern const Table table;                      \
   }
-#define HEADBENCH_RUNNABLE(table) runs_avx512() ? &avx512::table : nullptr, runs_avx2() ? &avx2::table : nullptr
-#elif defined(HEADBENCH_NEON)
+#if defined(HEADBENCH_AVX512)
 #define HEADBENCH_DECLARE(Table, table) \
-  namespace neon {                      \
-  extern const Table table;             \
-  }
+  HEADBENCH_DECLARE_SET(Table, table, avx512) HEADBENCH_DECLARE_SET(Table, table, avx2)
+#define HEADBENCH_RUNNABLE(table) runs_avx512() ? &avx512::table : nullptr, runs_avx2() ? &avx2::table : nullptr
+#elif defined(HEADBENCH_X86)
+#define HEADBENCH_DECLARE(Table, table) HEADBENCH_DECLARE_SET(Table, table, avx2)
+#define HEADBENCH_RUNNABLE(table) runs_avx2() ? &avx2::table : nullptr
+#elif defined(HEADBENCH_NEON)
+#define HEADBENCH_DECLARE(Table, table) HEADBENCH_DECLARE_SET(Table, table, neon)
 #define HEADBENCH_RUNNABLE(table) &neon::table  // part of every 64-bit ARM processor
 #else
 #define HEADBENCH_DECLARE(Table, table)
@@ -34,9 +33,7 @@
 
 #define HEADBENCH_VARIANTS(Table, table)                                             \
   HEADBENCH_DECLARE(Table, table)                                                    \
-  namespace portable {                                                               \
-  extern const Table table;                                                          \
-  }                                                                                  \
+  HEADBENCH_DECLARE_SET(Table, table, portable)                                      \
   inline std::vector<const Table*> runnable_##table() {                              \
     std::vector<const Table*> found;                                                 \
     using Tables = std::initializer_list<const Table*>;                              \

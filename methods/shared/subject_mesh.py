@@ -6,7 +6,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Generic, TypeVar
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -141,6 +140,8 @@ def mouth_mask(camera: Camera, mouth: FloatArray, middle: FloatArray) -> BoolArr
     mask, center = np.zeros((camera.height, camera.width), np.uint8), mouth.mean(0)
     depths = mouth @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
     if depths.min() > 0 and (center - middle) @ (camera.center - center) > 0:
+        import cv2  # not everywhere where methods are trained
+
         # cv2 counts from the centre of the first pixel, cameras from its corner.
         corners = np.round(project(mouth, camera) - 0.5).clip(-(2**15), 2**15).astype(np.int32)
         cv2.fillConvexPoly(mask, cv2.convexHull(corners), 1)

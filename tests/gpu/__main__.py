@@ -1,9 +1,9 @@
 """``make gpu``: whether a GPU gives the CPU's numbers, and how fast; one table of what was found against its bounds.
 
-Each step takes ten minutes at most, runs in a process of its own, and can be run alone (``--step 2``); what it found is kept
-in the output folder. Exit codes: 0, 1 where a bound is not kept or a step did not end, 3 where there is no such device.
+Each step runs in a process of its own, of limited time, all together in eight minutes, and can be run alone (``--step 2``);
+what it found is printed and kept in the output folder number by number. Exit codes: 0, 1 where a bound is not kept or a step did not end, 3 where there is no such device.
 
-Without a network: ``--wheels DIR`` collects the wheels on a machine that has one and prints how to install from them.
+On a machine without a network: ``bare.py``.
 """
 
 from __future__ import annotations
@@ -23,52 +23,37 @@ from headbench.bench.io.documents import checked, read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.machine import check_device, machine_record
 
-from .steps import ROOT, STEPS, Bar
+from .steps import LIMITS_S, STEPS, Bar
 
-LIMIT_S = 600.0
 NO_DEVICE = 3
 
 
-LOCK = [
-    word for name in ("torch-cuda.txt", "dev.txt") for word in ("--requirement", f"requirements-{name}")
-] + ["--requirement", "requirements.txt"]
-"""The locked packages of a machine with a GPU, as pip takes them."""
-
-
-def wheels(folder: Path) -> int:
-    """Collect the locked packages for a machine with a GPU as wheels; print how to install from them."""
-    command = [sys.executable, "-m", "pip", "download", "--only-binary", ":all:", "--no-deps"]
-    done = subprocess.run([*command, "--dest", str(folder.resolve()), *LOCK], cwd=ROOT, check=False)
-    if done.returncode == 0:
-        print(
-            f"Install: pip install --no-deps --no-index --find-links {folder} {' '.join(LOCK)} && "
-            "pip install --no-deps --no-build-isolation --editable ."
-        )
-    return done.returncode
-
-
 def run_step(step: int, device: str, out: Path) -> None:
-    """Run a step in this process and keep what it found."""
+    """Run a step in this process; what it found is written after every number."""
+    bars: list[Bar] = []
+    record = {"device": device, "machine": machine_record(device)}
+
+    def report(bar: Bar) -> None:
+        # JSON has no infinity.
+        finite = bar.found is not None and math.isfinite(bar.found)
+        bars.append(bar if finite else replace(bar, found=None))
+        print("  ".join(filter(None, bar.cells().values())), file=sys.stderr, flush=True)
+        write_json(out / f"step-{step}.json", record | {"bars": [asdict(bar) for bar in bars]})
+
     try:
-        bars = STEPS[step](device, out / f"step-{step}")
+        STEPS[step](device, out / f"step-{step}", report)
+        report(Bar("ended", 0.0, 0.0))
     except Exception as error:  # noqa: BLE001 - other steps are still to be run, and the table tells
         traceback.print_exc()
-        bars = [Bar(f"ended: {type(error).__name__}", math.inf, 0.0)]
-    # JSON has no infinity.
-    bars = [
-        replace(bar, found=None) if bar.found is None or not math.isfinite(bar.found) else bar for bar in bars
-    ]
-    record = {"device": device, "machine": machine_record(device), "bars": [asdict(bar) for bar in bars]}
-    write_json(out / f"step-{step}.json", record)
+        report(Bar(f"ended: {type(error).__name__}", None, 0.0))
 
 
 def kept(step: int, device: str, out: Path) -> list[Bar]:
     """What a step found; one bar that is not kept where it has not ended on this device."""
     path = out / f"step-{step}.json"
     record = read_json(path) if path.exists() else {}
-    if record.get("device") != device:
-        return [Bar("ended", None, 0.0)]
-    return checked(record["bars"], list[Bar], path)
+    bars = checked(record["bars"], list[Bar], path) if record.get("device") == device else []
+    return bars if bars and bars[-1].what.startswith("ended") else [*bars, Bar("ended", None, 0.0)]
 
 
 def shown(found: dict[int, list[Bar]]) -> str:
@@ -86,10 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--out", type=Path, default=Path("build/gpu"))
     parser.add_argument("--step", type=int, choices=list(STEPS), help="run this step alone")
-    parser.add_argument("--wheels", type=Path, help="collect wheels in this folder, and nothing else")
     options = parser.parse_args(arguments)
-    if options.wheels:
-        return wheels(options.wheels)
     try:
         check_device(options.device)
     except HeadbenchError as error:
@@ -108,11 +90,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             subprocess.run(
                 [sys.executable, "-m", "headbench.tests.gpu", *own],
                 stdout=subprocess.DEVNULL,
-                timeout=LIMIT_S,
+                timeout=LIMITS_S[step],
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            print(f"step {step} was ended after {LIMIT_S:.0f} s", file=sys.stderr)
+            print(f"step {step} was ended after {LIMITS_S[step]} s", file=sys.stderr)
     found = {step: kept(step, options.device, options.out) for step in steps}
     print(shown(found))
     return int(not all(bar.holds for bars in found.values() for bar in bars))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -13,23 +14,32 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from headbench.bench import cli
 from headbench.bench.benchmarks import take_turns
+from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget, no_progress
-from headbench.bench.engine.config import RunOptions
-from headbench.bench.engine.job import Job
-from headbench.bench.engine.jobs import load, trained
 from headbench.bench.machine import use_device
-from headbench.bench.registry import discover
-from headbench.bench.rows import ALL, Rows
+from headbench.bench.registry import discover, resolve
+from headbench.bench.specs import MethodSpec
 from headbench.methods.benchmarks.scenes import SplatScene, head_shell, relative_error
+from headbench.methods.benchmarks.untrained import MemoryClip, untrained, with_images
 from headbench.methods.shared.loop import CHECKPOINT, synchroniser
 from headbench.methods.splats import cuda, rasterize
 from headbench.metrics.speed import SpeedProtocol, measure_speed
-from headbench.tests.world import small_run
 
-ROOT = Path(__file__).parents[2]
+from ..methods.flashavatar.small import SMALL as SMALL_FLASHAVATAR
+from ..methods.gha.small import SMALL as SMALL_GHA
+from ..methods.insta.small import SMALL as SMALL_INSTA
+from ..methods.rgbavatar.small import SMALL as SMALL_RGBAVATAR
+
 ITERATIONS = 6
+SMALL = {
+    "flashavatar": SMALL_FLASHAVATAR,
+    "gbs": {"samples": 200, "teeth_samples": 20},
+    "gha": {**SMALL_GHA, "start_steps": 2, "motion_steps": 2},
+    "insta": SMALL_INSTA,
+    "rgbavatar": SMALL_RGBAVATAR,
+}
+"""Small forms of the methods that are slow at the preset smoke."""
 
 
 @dataclass(frozen=True)
@@ -58,21 +68,21 @@ class Bar:
         return {"what": self.what, "bound": bound, "found": found, "verdict": verdict}
 
 
-def rasteriser(device: str, folder: Path) -> list[Bar]:
+Report = Callable[[Bar], None]
+"""Takes a number as soon as it is found, so that nothing is lost where a step is ended."""
+
+
+def rasteriser(device: str, folder: Path, report: Report) -> None:
     """Images and gradients of the rasteriser against the float64 reference on the CPU."""
     size = (3_000, 120, 100) if device != "cpu" else (200, 40, 32)
     scenes = {"head": (head_shell(*size), False), "antialiased": (head_shell(*size, seed=1), True)}
     scenes["7 channels"] = head_shell(*size, channels=7), False
-    bars = []
     for name, (scene, antialiased) in scenes.items():
         image, gradients = _passes(scene, device, torch.float32, "auto", antialiased)
         truth, wanted = _passes(scene, "cpu", torch.float64, "reference", antialiased)
         worst = max(relative_error(value, true) for value, true in zip(gradients, wanted, strict=True))
-        bars += [
-            Bar(f"rasteriser, {name}: image, mean difference", float((image - truth).abs().mean()), 1e-5),
-            Bar(f"rasteriser, {name}: worst gradient, relative", worst, 5e-3),
-        ]
-    return bars
+        report(Bar(f"rasteriser, {name}: image, mean difference", float((image - truth).abs().mean()), 1e-5))
+        report(Bar(f"rasteriser, {name}: worst gradient, relative", worst, 5e-3))
 
 
 def _passes(
@@ -95,50 +105,62 @@ def _passes(
     return image.detach().cpu().double(), [leaf.grad.cpu() for leaf in leaves if leaf.grad is not None]
 
 
-def methods(device: str, folder: Path) -> list[Bar]:
+def methods(device: str, folder: Path, report: Report) -> None:
     """Every native method after a few iterations on both sides, and killed and continued on the device."""
-    bars = []
-    for job in _jobs(device, folder):
-        name = job.method.spec.name
-        on_cpu = _picture(job, _fitted(job, folder / name / "cpu", "cpu"))
-        on_device = _picture(job, _fitted(job, folder / name / "device", device))
-        continued, first = _continued(job, folder / name / "killed", device)
-        bars += [
-            Bar(
-                f"{name}: image after {ITERATIONS} iterations, mean difference",
-                _mean(on_device, on_cpu),
-                1e-3,
-            ),
-            Bar(f"{name}: first iteration after a kill", first, 2, least=True),
-            Bar(f"{name}: image of the continued run, mean difference", _mean(continued, on_device), 1e-3),
-        ]
-    return bars
-
-
-def _jobs(device: str, folder: Path) -> list[Job]:
-    """The native methods that compute on the device, each trained a little on a tiny capture, on the CPU."""
     shutil.rmtree(folder, ignore_errors=True)
-    specs = [plugin.spec for plugin in discover("methods").values() if plugin.spec]
-    names = [spec.name for spec in specs if spec.native and not spec.trivial and spec.computes_on(device)]
-    run = small_run(folder, *names)
-    return trained(run.root, (), RunOptions(), folder / "kept")[1]
+    clip = with_images(*untrained(2_000, 48, 64, cameras=3, timesteps=3))
+    for plugin in discover("methods").values():
+        spec = plugin.spec
+        if not spec or not spec.native or spec.trivial or not spec.computes_on(device):
+            continue
+        home = folder / spec.name
+        try:
+            on_cpu = _picture(clip, _fitted(spec, clip, home / "cpu", "cpu"))
+            on_device = _picture(clip, _fitted(spec, clip, home / "device", device))
+            report(
+                Bar(
+                    f"{spec.name}: image after {ITERATIONS} iterations, mean difference",
+                    _mean(on_device, on_cpu),
+                    1e-3,
+                )
+            )
+            continued, first = _continued(spec, clip, home / "killed", device)
+            report(Bar(f"{spec.name}: first iteration after a kill", first, 2, least=True))
+            report(
+                Bar(
+                    f"{spec.name}: image of the continued run, mean difference",
+                    _mean(continued, on_device),
+                    1e-3,
+                )
+            )
+        except Exception as error:  # noqa: BLE001 - other methods are still to be tried
+            report(Bar(f"{spec.name}: ended by {type(error).__name__}: {str(error)[:200]}", None, 0.0))
 
 
-def _fitted(job: Job, out: Path, device: str, progress: Any = no_progress) -> Any:
-    method = job.method.create()
-    config = method.config
+def _created(spec: MethodSpec, preset: str, changes: Mapping[str, Any]) -> Any:
+    """The method with the settings of a preset, and some others."""
+    chosen = {**spec.presets.get(preset, {}), **changes}
+    chosen.pop("budget", None)
+    config = build(resolve(spec.config), chosen, preset)
     if hasattr(config, "splats"):
-        method.config = replace(config, splats=replace(config.splats, checkpoint_every_s=0.0))
+        config = replace(config, splats=replace(config.splats, checkpoint_every_s=0.0))
     else:
-        method.config = replace(config, checkpoint_every_s=0.0)
-    return method.fit(job.form.clip, out, Budget(ITERATIONS), device=device, seed=0, progress=progress)
+        config = replace(config, checkpoint_every_s=0.0)
+    return resolve(spec.implementation)(config)
+
+
+def _fitted(spec: MethodSpec, clip: MemoryClip, out: Path, device: str, progress: Any = no_progress) -> Any:
+    budget = Budget(ITERATIONS)
+    return _created(spec, "smoke", SMALL.get(spec.name, {})).fit(
+        clip, out, budget, device=device, seed=0, progress=progress
+    )
 
 
 class _Killed(Exception):
     pass
 
 
-def _continued(job: Job, out: Path, device: str) -> tuple[np.ndarray, int]:
+def _continued(spec: MethodSpec, clip: MemoryClip, out: Path, device: str) -> tuple[np.ndarray, int]:
     """A picture of an avatar whose training was killed half way, and the iteration that it continued with."""
 
     def kill(done: int, total: int, note: str = "") -> None:
@@ -146,52 +168,63 @@ def _continued(job: Job, out: Path, device: str) -> tuple[np.ndarray, int]:
             raise _Killed
 
     try:
-        _fitted(job, out, device, kill)
+        _fitted(spec, clip, out, device, kill)
     except _Killed:
         pass
     seen: list[int] = []
-    avatar = _fitted(job, out, device, lambda done, total, note="": seen.append(done))
-    return _picture(job, avatar), next(
+    avatar = _fitted(spec, clip, out, device, lambda done, total, note="": seen.append(done))
+    return _picture(clip, avatar), next(
         (done for done in seen if done), 0
     )  # 0 is reported while sizes are planned
 
 
-def _picture(job: Job, avatar: Any) -> np.ndarray:
-    form, key = job.form, min(job.clip.splits["novel_view"])
-    seen = form.key(key)
-    return np.asarray(avatar.render(form.clip.cameras[seen.camera], form.clip.poses[seen.timestep]).rgb)
+def _picture(clip: MemoryClip, avatar: Any) -> np.ndarray:
+    key = clip.splits["train"][-1]
+    return np.asarray(avatar.render(clip.cameras[key.camera], clip.poses[key.timestep]).rgb)
 
 
 def _mean(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.abs(one.astype(np.float64) - other).mean())
 
 
-def speed(device: str, folder: Path) -> list[Bar]:
-    """The rasteriser against gsplat's own function, and the stages of a frame of every avatar."""
+def speed(device: str, folder: Path, report: Report) -> None:
+    """The rasteriser against gsplat's own function; iterations and frames a second of ga and ours."""
     large = device != "cpu"
-    scene = head_shell(*((60_000, 550, 802) if large else (200, 40, 32)))
+    count, width, height = (60_000, 550, 802) if large else (2_000, 40, 32)
+    what = f"{count:,} splats at {width}x{height}"
+    scene = head_shell(count, width, height)
     ours, bare = _timed(scene, device)
-    runs = {"ours": ours, "bare": bare}
-    seconds = take_turns(runs, 500 if large else 2)
+    seconds = take_turns({"ours": ours, "bare": bare}, 200 if large else 2)
     medians = {name: float(np.median(values)) for name, values in seconds.items()}
-    what = "both passes of the rasteriser" + (", 60,000 splats at 550x802" if large else "")
-    bars = [
-        Bar(f"{what}: ms", 1e3 * medians["ours"]),
-        Bar(f"{what}: time over that of bare gsplat", medians["ours"] / medians["bare"], 1.05),
-    ]
-    short = SpeedProtocol(warm_up=2, warm_up_limit=2, latency=2, throughput=2, stages=2, static=2)
-    for job in _jobs(device, folder):
-        avatar = load(replace(job, device=device))
-        clip = job.form.clip
-        cameras = [c.resized(550, 802) if large else c for _, c in sorted(clip.cameras.items())]
-        frames = zip(cycle(cameras), cycle(clip.poses.values()))
-        details = measure_speed(
-            avatar, list(islice(frames, len(cameras))), SpeedProtocol() if large else short
-        ).details
-        name = f"{job.method.spec.name}, tiny avatar" + (" at 550x802" if large else "")
-        shown = {key: value for key, value in details.items() if key in SHOWN}
-        bars += [Bar(f"{name}: {key}", value) for key, value in shown.items()]
-    return bars
+    report(Bar(f"both passes of the rasteriser, {what}: ms", 1e3 * medians["ours"]))
+    report(Bar("rasteriser: time over that of bare gsplat", medians["ours"] / medians["bare"], 1.05))
+    # Splats are not seen to multiply in so few iterations: ga starts with one a triangle, the rest follows from the preset.
+    clip = with_images(*untrained(count, width, height, cameras=2, timesteps=4))
+    for name in ("ga", "ours"):
+        spec = discover("methods")[name].spec
+        avatar, rate = _rate(spec, clip, folder / name, device, 400 if large else 20)
+        report(Bar(f"{name} at {width}x{height}: iterations a second", rate))
+        frames = [(camera, pose) for pose in clip.poses.values() for camera in clip.cameras.values()]
+        short = SpeedProtocol(warm_up=2, warm_up_limit=2, latency=2, throughput=2, stages=2, static=2)
+        details = measure_speed(avatar, frames, SpeedProtocol() if large else short).details
+        for key, value in details.items():
+            if key in SHOWN:
+                report(Bar(f"{name} at {width}x{height}: {key}", value))
+
+
+def _rate(spec: MethodSpec, clip: MemoryClip, out: Path, device: str, iterations: int) -> tuple[Any, float]:
+    """An avatar and the iterations a second of the second half of its training."""
+    wait, times = synchroniser(device), {}
+
+    def note(done: int, total: int, text: str = "") -> None:
+        wait()
+        times[done] = time.perf_counter()
+
+    method = _created(spec, "demo", {})
+    avatar = method.fit(clip, out, Budget(iterations), device=device, seed=0, progress=note)
+    later = {done: at for done, at in times.items() if done >= iterations // 2}
+    first, last = min(later), max(later)
+    return avatar, (last - first) / (later[last] - later[first]) if last > first else math.nan
 
 
 SHOWN = (
@@ -222,41 +255,6 @@ def _timed(scene: SplatScene, device: str) -> tuple[Callable[[], None], Callable
     return ours, ours if device == "cpu" else bare
 
 
-def demo(device: str, folder: Path) -> list[Bar]:
-    """PSNR of the demonstration on the device against the CPU's table; continues where it was ended."""
-    small = ["--preset", "smoke", "--set", "methods=ga"] if device == "cpu" else []
-    metrics = ["psnr", *(TIMES if device != "cpu" else TIMES[:1])]
-    given = ["--set", f"device={device}", "--set", f"metrics={','.join(metrics)}", *small]
-    code = cli.main(["demo", "--out", str(folder), *given])
-    if code:
-        raise RuntimeError(f"headbench demo ended with exit code {code}")
-    rows = Rows.read(folder / "rows.parquet")
-    found = dict(_means(rows))
-    # The stored demo, whose table the README has; at small sizes there is none, and this one is compared with itself.
-    stored = found if device == "cpu" else dict(_means(Rows.read(ROOT / "reports/gallery/rows.parquet")))
-    bars = [
-        Bar(f"demo, {method}, {task}: dB from the CPU's table", abs(value - stored[method, task]), 0.3)
-        for (method, task), value in found.items()
-    ]
-    timed = rows.select(method=ALL, metric=ALL, task="", region="full", seeds=ALL)
-    for row in timed[timed["metric"].isin(TIMES) & (timed["status"] == "ok")].itertuples():
-        bars.append(Bar(f"demo, {row.method}: {row.metric}", float(row.value)))
-    return bars
-
-
-TIMES = (
-    *("fps", "throughput", "latency_p50", "latency_p99"),
-    *("stage_drive", "stage_deform", "stage_rasterize", "stage_post", "stage_read_back"),
-)
-"""Metrics of speed: what the stages of a frame take, of avatars of the demonstration's size."""
-
-
-def _means(rows: Rows) -> Iterator[tuple[tuple[str, str], float]]:
-    """PSNR of each trained method and task, dB: means over frames, then sequences."""
-    chosen = rows.select(method=ALL, metric="psnr", task=ALL, region="full", seeds=ALL)
-    trivial = [name for name, plugin in discover("methods").items() if plugin.spec and plugin.spec.trivial]
-    for (method, task), part in chosen[~chosen["method"].isin(trivial)].groupby(["method", "task"]):
-        yield (str(method), str(task)), float(part.groupby("sequence")["value"].mean().mean())
-
-
-STEPS: dict[int, Callable[[str, Path], Sequence[Bar]]] = {1: rasteriser, 2: methods, 3: speed, 4: demo}
+STEPS: dict[int, Callable[[str, Path, Report], None]] = {1: rasteriser, 2: methods, 3: speed}
+LIMITS_S = {1: 180, 2: 110, 3: 100}
+"""What each may take; the first compiles gsplat's kernels."""

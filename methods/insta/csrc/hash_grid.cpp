@@ -10,8 +10,6 @@ namespace headbench::insta {
 
 namespace {
 
-constexpr std::int64_t kPointsPerTask = 2048;
-
 struct Corners {
   std::int64_t row[8];
   float weight[8];
@@ -84,6 +82,7 @@ void encode(const Kernels& kernels, const float* positions, std::int64_t count, 
   field.table = table;
   const std::int64_t width = features * static_cast<std::int64_t>(levels.size());
   const Scratch scratch(width * kGroupMax, threads);
+  constexpr std::int64_t kPointsPerTask = 2048;
   parallel_for(count, kPointsPerTask, threads, [&](std::int64_t begin, std::int64_t end, int worker) {
     kernels.encode(field, positions + 3 * begin, end - begin, out + begin * width, scratch.of(worker));
   });

@@ -270,12 +270,8 @@ inline void draw_tile_backward_with(const Camera& view, const Splats& splats, co
 
 inline void draw_tile_backward(const Camera& view, const Splats& splats, const FrameData& frame,
                                const Gradients& grads, int tile, float* scratch) {
-  switch (splats.channels) {
-    case 1: return draw_tile_backward_with<1>(view, splats, frame, grads, tile, scratch);
-    case 3: return draw_tile_backward_with<3>(view, splats, frame, grads, tile, scratch);
-    case 4: return draw_tile_backward_with<4>(view, splats, frame, grads, tile, scratch);
-    default: return draw_tile_backward_with<0>(view, splats, frame, grads, tile, scratch);
-  }
+  if (splats.channels == 3) draw_tile_backward_with<3>(view, splats, frame, grads, tile, scratch);
+  else draw_tile_backward_with<0>(view, splats, frame, grads, tile, scratch);
 }
 
 }  // namespace headbench::HEADBENCH_ISA

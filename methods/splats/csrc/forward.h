@@ -122,12 +122,8 @@ inline void draw_tile_with(const Camera& view, const Splats& splats, const Frame
 
 inline void draw_tile(const Camera& view, const Splats& splats, const FrameData& frame, const ImageOut& out,
                       int tile, float* scratch) {
-  switch (splats.channels) {
-    case 1: return draw_tile_with<1>(view, splats, frame, out, tile, scratch);
-    case 3: return draw_tile_with<3>(view, splats, frame, out, tile, scratch);
-    case 4: return draw_tile_with<4>(view, splats, frame, out, tile, scratch);
-    default: return draw_tile_with<0>(view, splats, frame, out, tile, scratch);
-  }
+  if (splats.channels == 3) draw_tile_with<3>(view, splats, frame, out, tile, scratch);
+  else draw_tile_with<0>(view, splats, frame, out, tile, scratch);
 }
 
 }  // namespace headbench::HEADBENCH_ISA
