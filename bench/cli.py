@@ -12,6 +12,7 @@ from importlib.metadata import version
 
 from .errors import ExitCode, HeadbenchError, Interruption
 from .streams import prepare_streams, show
+from .terminal import wrapped
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -43,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _fail(message: str, code: ExitCode) -> ExitCode:
-    print(f"headbench: {message}", file=sys.stderr)
+    print(wrapped(f"headbench: {message}", sys.stderr), file=sys.stderr)
     return code
 
 
