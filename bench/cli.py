@@ -70,7 +70,7 @@ def _call(words: list[str]) -> int:
     if words and words[0] in ("--version", "-V", "version"):
         show(f"headbench {version('headbench')}")
         return ExitCode.OK
-    if not words or words[0] == "help":
+    if words[:1] == ["help"]:
         words = [*words[1:], "--help"]
     from .commands import call  # imports the specs of all commands
 

@@ -30,7 +30,7 @@ def width_of(stream: TextIO) -> int | None:
 
 
 def wrapped(text: str, stream: TextIO | None = None) -> str:
-    """Wrap long lines between words. Lines with several columns continue below the last one."""
+    """Wrap long lines between words. They continue below their text, after a bullet and columns at the beginning."""
     width = width_of(stream or sys.stdout)
     return text if width is None else "\n".join(_wrapped(line, width) for line in text.split("\n"))
 
@@ -38,8 +38,8 @@ def wrapped(text: str, stream: TextIO | None = None) -> str:
 def _wrapped(line: str, width: int) -> str:
     if "\x1b" in line or len(line) <= width:  # a line with styles is one of a table, which fits
         return line
-    columns = [match.end() for match in re.finditer(r"\S {2,}(?=\S)", line[: width // 2 + 1])]
-    indent = " " * max([len(line) - len(line.lstrip()), *columns])
+    starts = re.finditer(r"^ *(?:(?:[-*]|\[\d+\]) )?|\S {2,}(?=\S)", line[: width * 2 // 3])
+    indent = " " * max(match.end() for match in starts)
     return textwrap.fill(line, width, subsequent_indent=indent, break_on_hyphens=False)
 
 
