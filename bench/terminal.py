@@ -53,54 +53,47 @@ def table(
     a note in brackets. Without ``fit`` the text is that for a pipe.
     """
     from rich.box import Box
+    from rich.cells import cell_len
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     width = (width_of(sys.stdout) if fit else None) or UNLIMITED
+    styled = fit and sys.stdout.isatty() and not os.environ.get("NO_COLOR")
+    # Without a height, a dumb terminal has 80 columns.
+    console = Console(width=width, height=25, force_terminal=styled, highlight=False)
+    ruled = Box(f"    \n    \n -  \n    \n {_GROUP}  \n    \n    \n    \n", ascii=True)
     columns = list(zip(head, *(line for line in lines if len(line) > 1), strict=True))
     numbers = {i for i, column in enumerate(columns) if i >= names and any(map(_NUMBER.match, column[1:]))}
     columns = [_to_the_right(column) if i in numbers else column for i, column in enumerate(columns)]
-    least = [width // 2 // names if i < names else width if i in numbers else LEAST for i in range(len(head))]
-    least = [min(size, max(map(len, column))) for size, column in zip(least, columns)]
+    most = [width // 2 // names if i < names else width if i in numbers else LEAST for i in range(len(head))]
+    sizes = [min(size, max(map(cell_len, column))) for size, column in zip(most, columns)]
     parts = [[*range(names)]]
     for i in range(names, len(head)):
-        if len(parts[-1]) > names and sum(least[j] + 2 for j in [*parts[-1], i]) - 2 > width:
+        if len(parts[-1]) > names and sum(sizes[j] + 2 for j in [*parts[-1], i]) - 2 > width:
             parts.append([*range(names)])
         parts[-1].append(i)
-    styled = fit and sys.stdout.isatty() and not os.environ.get("NO_COLOR")
-    console = Console(
-        width=width,
-        height=25,  # without it, a dumb terminal has 80 columns
-        color_system="auto" if styled else None,
-        force_terminal=styled,
-        highlight=False,
-    )
-    ruled = Box(f"    \n    \n -  \n    \n {_GROUP}  \n    \n    \n    \n", ascii=True)
-    texts = []
-    for place, part in enumerate(parts):
-        rows, titles = zip(*(columns[i] for i in part), strict=True), []
+    texts: list[str] = []
+    for part in parts:
         grid = Table(box=ruled, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-        for i, name in zip(part, next(rows), strict=True):
-            grid.add_column(
-                Text(name), width=least[i] if i < names or i in numbers else None, overflow="fold"
-            )
+        for i in part:
+            fixed = sizes[i] if i < names or i in numbers else None
+            grid.add_column(Text(columns[i][0]), width=fixed, overflow="fold")
+        rows = zip(*(columns[i][1:] for i in part), strict=True)
         for line in lines:
-            if len(line) > 1:
-                grid.add_row(*(Text(cell, "bold" if " *" in cell[1:] else "") for cell in next(rows)))
-            else:
-                titles.append(textwrap.fill(line[0], width))
+            if len(line) == 1:
                 grid.add_section()
+            else:
+                grid.add_row(*(Text(cell, "bold" if " *" in cell[1:] else "") for cell in next(rows)))
+        groups = (textwrap.fill(line[0], width) for line in lines if len(line) == 1)
         with console.capture() as printed:
             if title:
-                console.print(Text(f"{title}, continued" if place else title, "bold"))
+                console.print(Text(f"{title}, continued" if texts else title, "bold"))
             if lines and len(lines[0]) == 1:
-                console.print(titles.pop(0))
+                console.print(Text(next(groups)))
             console.print(grid)
-        text = printed.get()
-        for group in titles:
-            text = re.sub(rf"[{_GROUP} ]*{_GROUP}[{_GROUP} ]*", lambda _, group=group: group, text, count=1)
-        texts.append("\n".join(line.rstrip() for line in text.splitlines()))
+        shown = (next(groups) if _GROUP in line else line.rstrip() for line in printed.get().splitlines())
+        texts.append("\n".join(shown))
     return "\n\n".join(texts)
 
 

@@ -115,30 +115,26 @@ def points_text(
     costs = {name for name, _ in MEASURED.values()}
     avatar = [spec for spec in metrics if not spec.per_frame and spec.name not in costs]
     tracked = any(point.tracking_error is not None for point in points)
-    heads = [
-        "method",
-        "part",
-        "budget",
-        "cameras",
-        "timesteps",
-        "pictures",
-        *["tracking"] * tracked,
-        "CPU s",
-        "s",
-    ]
-    heads += [f"{spec.label} of held-out {HELD_OUT[task]}" for task in tasks for spec in frame]
+    place = ["method", "part", "budget"]
+    heads = [*place, "cameras", "timesteps", "pictures", *["tracking"] * tracked, "CPU s", "s"]
     heads += [f"{spec.label} {spec.unit}".rstrip() for spec in avatar]
-    rows = []
+    trainings: list[list[str]] = []
+    quality: dict[str, list[list[str]]] = {task: [] for task in tasks if frame}
     for point in points:
         budget = point.budget
         size = f"{budget.seconds:g} s" if budget.iterations is None else f"{budget.iterations}"
-        cells = [point.method, str(point.part), size]
-        cells += [f"{count:g}" for count in (point.cameras, point.timesteps, point.pictures)]
+        where = [point.method, str(point.part), size]
+        cells = [f"{count:g}" for count in (point.cameras, point.timesteps, point.pictures)]
         cells += [_shown(point.tracking_error, 2)] * tracked
         cells += [_shown(point.cost[key], 1) for key in ("processor_seconds", "seconds")]
-        cells += [_shown(point.values[column(spec, task)], spec.digits) for task in tasks for spec in frame]
-        rows.append([*cells, *(_shown(point.values[spec.name], spec.digits) for spec in avatar)])
-    lines = [table(heads, rows, names=3), ""]
+        cells += [_shown(point.values[spec.name], spec.digits) for spec in avatar]
+        trainings.append([*where, *cells])
+        for task, own in quality.items():
+            own.append([*where, *(_shown(point.values[column(spec, task)], spec.digits) for spec in frame)])
+    lines = [table(heads, trainings, names=3, title="Trainings"), ""]
+    for task, own in quality.items():
+        title = f"Quality, held-out {HELD_OUT[task]}"
+        lines += [table([*place, *(spec.label for spec in frame)], own, names=3, title=title), ""]
     lines.append("Means over subjects. Held out of every training; no test frame was used:")
     for subject, parameters in held.items():
         steps = ", ".join(map(str, parameters["timesteps"][:6])) + (

@@ -122,14 +122,14 @@ def _text(
     digits: int,
     note: str,
 ) -> str:
-    lines = []
+    rows = []
     for index, point in enumerate(points):
         costs = [
             f"{'-' if value is None else f'{value:.2f}'}{' *' if index in fronts[cost] else ''}"
             for cost, value in (("megabytes", point.megabytes), ("milliseconds", point.milliseconds))
         ]
-        lines.append([point.method, f"{point.quality:.{digits}f}", *costs, point.run])
-    lines = [table(["method", label, "MB", "ms", "run"], lines), "* On the front of size or time."]
+        rows.append([point.method, f"{point.quality:.{digits}f}", *costs, point.run])
+    lines = [table(["method", label, "MB", "ms", "run"], rows), "* On the front of size or time."]
     if any(point.derived_from for point in points):
         lines.append("METHOD+VARIANT was derived from the trained avatar, without training.")
     lines += [f"Frame times: {note}"] if note else []

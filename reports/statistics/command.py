@@ -57,10 +57,7 @@ class CompareSettings(BaselineOptions):
     test."""
 
     format: Literal["text", "csv"] = "text"
-    """Format of the output; --json prints everything, including the difference of each subject."""
-
-    details: bool = False
-    """With text: also the uncorrected p-values, and for how many subjects the first method is better."""
+    """Format of the output; csv adds uncorrected p-values and subjects won, --json also the difference of each subject."""
 
     dependent = (
         *DEPENDENT,
@@ -172,10 +169,8 @@ def compare_methods(
     if settings.format == "csv":
         text = _csv(every)
     else:
-        blocks = [
-            _text(spec, c, note_of(times.get(spec.name, {})), details=settings.details) for spec, c in found
-        ]
-        below = [_tests([*chain(*(c for _, c in found))]), runs.cameras, runs.part]
+        blocks = [_text(spec, c, note_of(times.get(spec.name, {}))) for spec, c in found]
+        below = [*_tests([*chain(*(c for _, c in found))]), runs.cameras, runs.part]
         text = "\n\n".join([*blocks, "\n".join(filter(None, below))])
     data = {"level": settings.level, "comparisons": every}
     return CommandResult(text, data, verbatim=settings.format == "csv")
@@ -229,8 +224,8 @@ def _csv(comparisons: Sequence[dict[str, Any]]) -> str:
     return csv_text(lines).rstrip()
 
 
-def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison], note: str, *, details: bool) -> str:
-    """One metric's comparisons as a table, with a note below; ``details`` adds the uncorrected p-value and the subjects won."""
+def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison], note: str) -> str:
+    """One metric's comparisons as a table for a terminal, with a note below."""
     from ..tables import AVATAR_TITLE
 
     first = comparisons[0]
@@ -238,32 +233,27 @@ def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison], note: str, 
     unit = f"{spec.unit}, " if spec.unit else ""
     better = "higher" if spec.higher_is_better else "lower"
     confidence = f"{100 * (1 - first.level):g} % interval"
-    more = ["p uncorrected", "first better"] if details else []
     lines = []
     for c in comparisons:
         name = f"{c.first} - {c.second}"
         if c.difference is None or c.p is None or c.p_holm is None:
-            lines.append([name, "-", "", "", *("" for _ in more), f"{c.verdict}: {c.reason}"])
+            lines.append([name, "-", "", "", f"{c.verdict}: {c.reason}"])
             continue
         # One digit more than the table, since differences are smaller than values.
         digits = spec.digits + 1
         bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f} {c.high:+.{digits}f}"
         numbers = [f"{c.difference:+.{digits}f}", bounds, f"{c.p_holm:.4f}"]
-        numbers += [f"{c.p:.4f}", f"{c.wins} of {c.subjects}"] if details else []
         verdict = "; ".join(filter(None, [c.verdict, equivalence_text(c, spec.unit)]))
         lines.append([name, *numbers, verdict])
-    heads = ["Methods", "Difference", confidence, "p", *more, "Conclusion"]
+    heads = ["Methods", "Difference", confidence, "p", "Conclusion"]
     shown = table(heads, lines, title=f"{title}, {spec.label} ({unit}{better} is better)")
     return "\n".join([shown, *([note] if note else [])])
 
 
-def _tests(comparisons: Sequence[PairedComparison]) -> str:
-    """How differences were tested, in a sentence; "" if none was."""
+def _tests(comparisons: Sequence[PairedComparison]) -> list[str]:
+    """How differences were tested, in a sentence; none if no difference was."""
     tested = [c for c in comparisons if c.family]
-    if not tested:
-        return ""
-    subjects = counted(max(c.subjects for c in tested), "subject")
-    family = counted(max(c.family for c in tested), "comparison")
-    return (
-        f"p: exact sign-flip test over {subjects}, corrected by Holm over the {family} of a metric in a task."
-    )
+    subjects = counted(max((c.subjects for c in tested), default=0), "subject")
+    family = counted(max((c.family for c in tested), default=0), "comparison")
+    text = f"p: exact sign-flip test over {subjects}, by Holm over the {family} of a metric in a task."
+    return [text] if tested else []
