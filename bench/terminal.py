@@ -1,7 +1,6 @@
 """Text and tables for a terminal, fitted to its width; for a pipe, plain and as wide as they need.
 
-``COLUMNS`` sets the width, of a pipe, too. ``NO_COLOR`` and ``TERM=dumb`` leave out styles, which only repeat what the text
-says.
+``COLUMNS`` sets the width of a terminal. ``NO_COLOR`` and ``TERM=dumb`` leave out styles, which only repeat what the text says.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ _GROUP = "\0"
 
 def width_of(stream: TextIO) -> int | None:
     """Characters of a line; None if there is no limit."""
-    given = os.environ.get("COLUMNS", "").isdigit()
-    return max(40, shutil.get_terminal_size().columns) if given or stream.isatty() else None
+    return max(40, shutil.get_terminal_size().columns) if stream.isatty() else None
 
 
 def wrapped(text: str, stream: TextIO | None = None) -> str:
