@@ -39,15 +39,15 @@ headbench compares methods that make animatable 3D avatars of heads from videos.
 recordings and scored on the same frames that it has not seen: image quality, size, speed.
 
 Try it; needs no data and no GPU, and takes a few minutes:
-  headbench demo                       train all methods on a synthetic head, and compare them
+  headbench demo                       compare all methods on a synthetic head
 
 With your own recordings, in the folder DATA, and results in a new folder OUT:
-  headbench lint DATA                  check the recordings for faults that make a comparison unfair
-  headbench run --data DATA --out OUT  train methods, measure them, write tables, pictures and OUT/report.html
+  headbench lint DATA                  check the recordings for faults
+  headbench run --data DATA --out OUT  train, measure, write OUT/report.html
 
 Results:
-  headbench table OUT                  print the table again, or write it for a paper
-  headbench compare OUT                test which differences between methods are significant
+  headbench table OUT                  print the table, also for a paper
+  headbench compare OUT                test the differences between methods
 
 `headbench list methods` lists the methods, `headbench --help` all commands, and `headbench run --help` the options of one.\
 """

@@ -22,6 +22,12 @@ _GROUP = "\0"
 """Drawn between groups of rows, until their title replaces it."""
 
 
+def _stdout() -> TextIO:
+    """Standard output, also while a display of progress has replaced it."""
+    stream: TextIO = getattr(sys.stdout, "rich_proxied_file", sys.stdout)
+    return stream
+
+
 def width_of(stream: TextIO) -> int | None:
     """Characters of a line; None if there is no limit."""
     return max(40, shutil.get_terminal_size().columns) if stream.isatty() else None
@@ -29,7 +35,7 @@ def width_of(stream: TextIO) -> int | None:
 
 def wrapped(text: str, stream: TextIO | None = None) -> str:
     """Wrap long lines between words. They continue below their text, after a bullet and columns at the beginning."""
-    width = width_of(stream or sys.stdout)
+    width = width_of(stream or _stdout())
     return text if width is None else "\n".join(_wrapped(line, width) for line in text.split("\n"))
 
 
@@ -56,8 +62,8 @@ def table(
     from rich.table import Table
     from rich.text import Text
 
-    width = (width_of(sys.stdout) if fit else None) or UNLIMITED
-    styled = fit and sys.stdout.isatty() and not os.environ.get("NO_COLOR")
+    width = (width_of(_stdout()) if fit else None) or UNLIMITED
+    styled = fit and _stdout().isatty() and not os.environ.get("NO_COLOR")
     # Without a height, a dumb terminal has 80 columns.
     console = Console(width=width, height=25, force_terminal=styled, highlight=False)
     ruled = Box(f"    \n    \n -  \n    \n {_GROUP}  \n    \n    \n    \n", ascii=True)
@@ -83,14 +89,18 @@ def table(
                 grid.add_section()
             else:
                 grid.add_row(*(Text(cell, "bold" if " *" in cell[1:] else "") for cell in next(rows)))
-        groups = (textwrap.fill(line[0], width) for line in lines if len(line) == 1)
+        groups = [textwrap.fill(line[0], width) for line in lines if len(line) == 1]
         with console.capture() as printed:
             if title:
                 console.print(Text(f"{title}, continued" if texts else title, "bold"))
-            if lines and len(lines[0]) == 1:
-                console.print(Text(next(groups)))
             console.print(grid)
-        shown = (next(groups) if _GROUP in line else line.rstrip() for line in printed.get().splitlines())
+        shown = []
+        for text in printed.get().splitlines():
+            shown.append(groups.pop(0) if _GROUP in text else text.rstrip())
+            if len(lines[0]) == 1 and not text.strip(
+                "- "
+            ):  # that of the first rows, below the line of dashes
+                shown.append(groups.pop(0))
         texts.append("\n".join(shown))
     return "\n\n".join(texts)
 

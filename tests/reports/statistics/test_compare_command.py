@@ -41,10 +41,12 @@ def folder(tmp_path, write_manifest):
 def test_text_tells_size_interval_test_and_verdict(folder):
     text = compare_runs(CompareSettings((str(folder),))).text
     novel, reenacted, size, how = text.split("\n\n")
-    head, names, _, line = novel.splitlines()
-    assert head == "Novel view, Error (levels, lower is better)"
+    head, names, _, metric, line = novel.splitlines()
+    assert (head, metric) == ("Novel view", "Error (levels, lower is better)")
     assert "95 % interval" in names
-    assert how.startswith("p: exact sign-flip test over 7 subjects, by Holm over the 1 comparison ")
+    assert how.startswith(
+        "p: exact sign-flip test over 7 subjects, with Holm's correction for the 1 comparison "
+    )
     # Mean of 2 (1 + s/10) over seven subjects: 2.6, good below bad; all of one sign: p = 2/2^7.
     for part in ("good - bad", "-2.600", "0.0156", "good is better"):
         assert part in line
@@ -81,9 +83,8 @@ def test_speeds_that_do_not_compare_have_a_note(folder, change_manifest, bad, fl
         rows.loc[own, list(given)] = list(given.values())
     Rows(rows).write(RunFolder(folder).rows)
     found = compare_runs(CompareSettings((str(folder),)))
-    *errors, size, _ = found.text.split("\n\n")
-    assert size.splitlines()[4:] == ([note] if note else [])
-    assert all("Measured" not in text for text in errors)
+    assert found.text.splitlines()[-1:] == ([f"Size: {note}"] if note else found.text.splitlines()[-1:])
+    assert found.text.count("Measured") == note.count("Measured")
     assert [c["note"] for c in found.data["comparisons"]] == ["", "", note]
     text = compare_runs(CompareSettings((str(folder),), format="csv")).text
     assert [line["note"] for line in csv.DictReader(io.StringIO(text))] == ["", "", note]
