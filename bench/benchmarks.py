@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import tyro
 
+from . import terminal
 from .contracts import Progress
 from .errors import InputError
 from .io.files import check_writable, write_json
@@ -52,19 +53,11 @@ def findings(tables: Mapping[str, Sequence[Row]], note: str, faults: Sequence[st
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Align rows under their column names; numbers right-aligned, floats with three significant digits."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    cells = [names, *([_cell(row.get(name)) for name in names] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    texts = [any(isinstance(row.get(name), str) for row in rows) for name in names]
-    lines = [
-        "  ".join(
-            cell.ljust(width) if text else cell.rjust(width)
-            for cell, width, text in zip(line, widths, texts, strict=True)
-        ).rstrip()
-        for line in cells
-    ]
-    return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
+    """Align rows under their column names, floats with three significant digits; text columns at the beginning are names."""
+    heads = list(dict.fromkeys(name for row in rows for name in row))
+    texts = [any(isinstance(row.get(name), str) for row in rows) for name in heads]
+    lines = [[_cell(row.get(name)) for name in heads] for row in rows]
+    return terminal.table(heads, lines, names=max(1, [*texts, False].index(False)))
 
 
 def _cell(value: Any) -> str:

@@ -12,6 +12,7 @@ from importlib.metadata import version
 
 from .errors import ExitCode, HeadbenchError, Interruption
 from .streams import prepare_streams, show
+from .terminal import wrapped
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -43,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _fail(message: str, code: ExitCode) -> ExitCode:
-    print(f"headbench: {message}", file=sys.stderr)
+    print(wrapped(f"headbench: {message}", sys.stderr), file=sys.stderr)
     return code
 
 
@@ -69,7 +70,7 @@ def _call(words: list[str]) -> int:
     if words and words[0] in ("--version", "-V", "version"):
         show(f"headbench {version('headbench')}")
         return ExitCode.OK
-    if not words or words[0] == "help":
+    if words[:1] == ["help"]:
         words = [*words[1:], "--help"]
     from .commands import call  # imports the specs of all commands
 

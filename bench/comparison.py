@@ -192,7 +192,7 @@ def _run(config: RunConfig, execution: Execution | None = None, **record: Any) -
     from .engine.run import run as run_comparison
 
     rows = run_comparison(config, execution, **record)
-    text = f"{_table([config.out])}\n\n{closing(Path(config.out), rows)}"
+    text = f"{_table([config.out], fit=True)}\n{closing(Path(config.out), rows)}"
     return CommandResult(
         text, {"out": config.out, "failed": rows.failed, "means": means(config.out)}, not rows.failed
     )

@@ -23,6 +23,7 @@ from .progress import log_to_terminal, progress
 from .registry import Plugin, discover, get, resolve
 from .specs import HELP, CommandSpec
 from .streams import show
+from .terminal import wrapped
 
 Command = Callable[..., Callable[[], int]]
 """Takes settings and returns a function that runs the command, which separates parsing errors from errors of the command."""
@@ -108,7 +109,10 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
         lock = locked(Path(folder)) if folder else nullcontext()
         with log_to_terminal(), lock, progress(name) as report:
             findings = resolve(spec.function)(settings, report)
-        show(json_module.dumps(findings.data, indent=1, default=to_jsonable) if json else findings.text)
+        if json:
+            show(json_module.dumps(findings.data, indent=1, default=to_jsonable))
+        else:
+            show(findings.text if findings.verbatim else wrapped(findings.text))
         if findings.code is not None:
             return findings.code
         return ExitCode.OK if findings.passed else ExitCode.NEGATIVE

@@ -376,6 +376,8 @@ class CommandResult(NamedTuple):
     """False if a check did not pass."""
     code: int | None = None
     """Exit code of a command that has others than 0 (passed) and 1 (did not pass); None for those two."""
+    verbatim: bool = False
+    """Whether the text is that of a file format, whose lines are not wrapped."""
 
 
 @dataclass(frozen=True)

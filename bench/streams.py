@@ -22,11 +22,6 @@ def prepare_streams() -> None:
             stream.reconfigure(errors="headbench")
 
 
-def on_terminal() -> bool:
-    """Whether standard output is a terminal."""
-    return sys.stdout.isatty()
-
-
 def _in_ascii(error: UnicodeError) -> tuple[str, int]:
     """Error handler for characters that an encoding lacks: replace them by `IN_ASCII`, or by JSON escapes."""
     if not isinstance(error, UnicodeEncodeError):

@@ -17,6 +17,7 @@ from ..bench.named_protocol import NamedProtocol, TaskFrames, named_protocols, p
 from ..bench.protocol import TASK_TITLES
 from ..bench.registry import get
 from ..bench.specs import CommandResult, MetricSpec
+from ..bench.terminal import table
 from .aggregate import summarise
 from .cameras import unseen_cameras
 from .runs import RunSet, synthetic_settings
@@ -183,7 +184,8 @@ def protocols_command(settings: ProtocolsSettings, progress: Progress) -> Comman
     for method in settings.methods:
         if method not in runs.methods:
             raise InputError("command line", "--methods", f"some of {', '.join(runs.methods)}", method)
-    text, values, refused = choice_effects(runs.only(settings.methods or runs.ranked or runs.methods))
+    shown = runs.only(settings.methods or runs.ranked or runs.methods)
+    text, values, refused = choice_effects(shown, markdown=settings.out is not None)
     data = {"values": values, "refused": refused}
     if settings.out is None:
         return CommandResult(text, data)
@@ -191,7 +193,9 @@ def protocols_command(settings: ProtocolsSettings, progress: Progress) -> Comman
     return CommandResult(settings.out, {**data, "out": settings.out})
 
 
-def choice_effects(runs: RunSet) -> tuple[str, dict[str, dict[str, float]], dict[str, str]]:
+def choice_effects(
+    runs: RunSet, *, markdown: bool = True
+) -> tuple[str, dict[str, dict[str, float]], dict[str, str]]:
     """Tables for `protocols_command`, the means by choice and "method task metric", and the choices that runs lack, with reasons."""
     values: dict[str, dict[str, float]] = {}
     refused: dict[str, str] = {}
@@ -202,7 +206,7 @@ def choice_effects(runs: RunSet) -> tuple[str, dict[str, dict[str, float]], dict
             refused[label] = f"{error.key}: expected {error.expected}"
             continue
         values[label] = _means(own)
-    return _text(runs.methods, values, refused), values, refused
+    return _text(runs.methods, values, refused, markdown=markdown), values, refused
 
 
 def _means(runs: RunSet) -> dict[str, float]:
@@ -218,17 +222,21 @@ def _means(runs: RunSet) -> dict[str, float]:
 
 
 def _text(
-    methods: Sequence[str], values: Mapping[str, Mapping[str, float]], refused: Mapping[str, str]
+    methods: Sequence[str],
+    values: Mapping[str, Mapping[str, float]],
+    refused: Mapping[str, str],
+    *,
+    markdown: bool,
 ) -> str:
-    """A table for each task: values under the usual protocol, then differences from them."""
+    """A table for each task, as Markdown or fitted to the terminal: values under the usual protocol, then differences from them."""
     parts = []
     base = values[USUAL]
     for task in ("novel_view", "self_reenactment"):
         columns = [(m, metric) for m in methods for metric in QUALITY if f"{m} {task} {metric}" in base]
         if not columns:
             continue
-        head = ["", *(f"{method} {metric.upper()}" for method, metric in columns)]
-        lines = [head, [":--", *("--:" for _ in columns)]]
+        head = ["" if markdown else "Choice", *(f"{method} {metric.upper()}" for method, metric in columns)]
+        lines = []
         for label, own in values.items():
             cells = []
             for method, metric in columns:
@@ -241,14 +249,20 @@ def _text(
                     cells.append(f"{own[key] - base[key]:+.{QUALITY[metric]}f}")
             if set(cells) != {"–"}:
                 lines.append([label, *cells])
-        table = pipe_table(lines)
+        rule = [":--", *("--:" for _ in columns)]
+        title = TASK_TITLES[task]
+        shown = (
+            f"### {title}\n\n{pipe_table([head, rule, *lines])}"
+            if markdown
+            else table(head, lines, title=title)
+        )
         spans = [
             max(found) - min(found)
             for m in methods
             if (found := [own[key] for own in values.values() if (key := f"{m} {task} psnr") in own])
         ]
         spread = f"The PSNR of one method differs by up to {max(spans, default=0):.1f} dB between these rows."
-        parts.append(f"### {TASK_TITLES[task]}\n\n{table}\n\n{spread}")
+        parts.append(f"{shown}\n\n{spread}")
     parts.append(
         'The row "usual" shows values: all frames and pixels, the mean over frames and then subjects, canonical metrics. Other rows show '
         "differences from it: a protocol changes all of its choices, any other row one choice."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -26,7 +25,9 @@ class TableSettings:
     """Folders of the runs."""
     format: Literal["text", "md", "csv", "latex", "html", "json"] | None = None
     """Aligned columns, Markdown, CSV, LaTeX (booktabs), a page of HTML, or JSON. Default: by the suffix of --out; without
-    it text on a terminal, else md."""
+    it text."""
+    details: bool = False
+    """With text: also the protocols with their hashes, and how values were averaged."""
     layout: str = "comparison"
     """Which table: comparison, speed (latency, throughput, stages) or cost (storage, training)."""
     paper: Annotated[str | None, tyro.conf.arg(name="as")] = None
@@ -47,28 +48,31 @@ class TableSettings:
     """File to write the table to, instead of printing it."""
 
 
-SUFFIXES = {".md": "md", ".txt": "md", ".tex": "latex", ".html": "html", ".csv": "csv", ".json": "json"}
+SUFFIXES = {".md": "md", ".txt": "text", ".tex": "latex", ".html": "html", ".csv": "csv", ".json": "json"}
 """Formats of tables by the suffix of a file."""
 
 
 def print_table(settings: TableSettings, progress: Progress) -> CommandResult:
     """Print a table of finished runs on the same frames, or write it to a file."""
-    from .table_report import table_text
+    from .table_report import tables_of, written
 
-    options = asdict(settings)
-    out = options.pop("out")
+    selection = asdict(settings)
+    out, details = selection.pop("out"), selection.pop("details")
+    suffix = "" if out is None else Path(out).suffix.lower()
     if out is not None:
         check_writable(Path(out), "--out")
-        if settings.format is None and Path(out).suffix.lower() not in SUFFIXES:
+        if settings.format is None and suffix not in SUFFIXES:
             expected = f"a suffix that names a format ({', '.join(SUFFIXES)}), or --format"
             raise InputError("command line", "--out", expected, out)
-    if settings.format is None:
-        options["format"] = SUFFIXES[Path(out).suffix.lower()] if out else None
-    runs = [Path(run) for run in options.pop("runs")]
-    text = table_text(runs, **options)
-    plain = re.sub(r"\x1b\[\d+m", "", text)  # without the styles of a terminal
-    data = {"format": options["format"] or ("md" if plain == text else "text"), "table": plain}
-    if out is None:
-        return CommandResult(text, data)
-    write_text(Path(out), text)
-    return CommandResult(out, {**data, "out": out})
+    form = selection["format"] = settings.format or SUFFIXES.get(suffix, "text")
+    if details and form != "text":
+        raise InputError("command line", "--details", "text, to which it adds", form)
+    tables = tables_of([Path(run) for run in selection.pop("runs")], **selection)
+    text = written(tables, form, details=details)
+    data = {"format": form, "table": text}
+    if out is not None:
+        write_text(Path(out), text)
+        return CommandResult(out, {**data, "out": out})
+    if form == "text":
+        text = written(tables, form, details=details, fit=True)
+    return CommandResult(text, data, verbatim=form != "text")

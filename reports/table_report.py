@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import pandas as pd
 
@@ -16,7 +16,6 @@ from ..bench.io.files import write_text
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from ..bench.registry import unknown
 from ..bench.specs import MetricSpec
-from ..bench.streams import on_terminal
 from .cameras import SPLIT_TASK
 from .papers import printed_tables
 from .printed import as_printed
@@ -134,7 +133,30 @@ def write_tables(run_folder: Path) -> list[Path]:
 
 def table_text(
     run_folders: Sequence[Path],
-    format: str | None = None,
+    format: str = "text",
+    layout: str = COMPARISON,
+    *,
+    details: bool = False,
+    fit: bool = False,
+    **selection: Any,
+) -> str:
+    """Return a table of one or more runs in a format of `WRITERS` or as "text", aligned columns.
+
+    ``details`` and ``fit`` are those of `to_text`, ``selection`` that of `tables_of`, which raises `InputError`.
+    """
+    tables = tables_of(run_folders, format, layout, **selection)
+    return written(tables, format, details=details, fit=fit)
+
+
+def written(tables: Iterable[Table], format: str, *, details: bool = False, fit: bool = False) -> str:
+    """Tables in a format, below each other."""
+    write = partial(to_text, details=details, fit=fit) if format == "text" else WRITERS[format][1]
+    return "\n".join(map(write, tables))
+
+
+def tables_of(
+    run_folders: Sequence[Path],
+    format: str,
     layout: str = COMPARISON,
     paper: str | None = None,
     number: str | None = None,
@@ -143,16 +165,13 @@ def table_text(
     sequences: tuple[str, ...] = (),
     columns: tuple[str, ...] = (),
     digits: tuple[str, ...] = (),
-) -> str:
-    """Return a table of one or more runs as text, in a format of `WRITERS` or "text" (aligned columns).
+) -> list[Table]:
+    """Build the table of runs, or the tables of a paper, for a format.
 
-    The default format is "text" if standard output is a terminal, else "md".
     ``paper`` names one of `papers`; the runs are shown in the form of its tables, or of the table ``number``, instead of a
     layout. ``protocol`` names one of `named_protocols`, which selects frames, pixels and metrics; ``region`` and ``sequences``
     are those of `FrameSelection`, ``columns`` and ``digits`` those of `Columns`. Raises `InputError` for invalid combinations.
     """
-    styled = format is None and on_terminal()
-    format = format or ("text" if styled else "md")
     if format not in (*WRITERS, "text"):
         raise InputError("table", "format", f"one of {', '.join(WRITERS)}, text", repr(format))
     part = FrameSelection(region, sequences)
@@ -166,18 +185,15 @@ def table_text(
         known = layouts(runs)
         if layout not in known:
             raise InputError(run_folders[0], "layout", f"one of {', '.join(known)}", repr(layout))
-        tables = [table_of(runs, layout, Columns(columns, digits))]
-    else:
-        if columns or digits or layout != COMPARISON:
-            expected = "no --layout, --columns or --digits beside it: a printed table has its own"
-            raise InputError("command line", "--as", expected, "one of them")
-        printed = printed_tables(paper, number)
-        if len(printed) > 1 and format not in ("text", "md", "latex"):
-            expected = f"one of {', '.join(table.table for table in printed)}, for a file of format {format}"
-            raise InputError("command line", "--table", expected, "none")
-        tables = [as_printed(runs, paper, table) for table in printed]
-    write = partial(to_text, styled=styled) if format == "text" else WRITERS[format][1]
-    return "\n".join(map(write, tables))
+        return [table_of(runs, layout, Columns(columns, digits))]
+    if columns or digits or layout != COMPARISON:
+        expected = "no --layout, --columns or --digits beside it: a printed table has its own"
+        raise InputError("command line", "--as", expected, "one of them")
+    printed = printed_tables(paper, number)
+    if len(printed) > 1 and format not in ("text", "md", "latex"):
+        expected = f"one of {', '.join(table.table for table in printed)}, for a file of format {format}"
+        raise InputError("command line", "--table", expected, "none")
+    return [as_printed(runs, paper, table) for table in printed]
 
 
 def layouts(runs: RunSet) -> tuple[str, ...]:

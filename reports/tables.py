@@ -84,6 +84,11 @@ class TaskSummary:
     frames: int
     subjects: int
 
+    @property
+    def size(self) -> str:
+        """Amount of data in words."""
+        return f"{counted(self.frames, 'frame')}, {counted(self.subjects, 'subject')}"
+
 
 AVERAGED = "frames, then sequences, then subjects"
 
@@ -92,7 +97,8 @@ AVERAGED = "frames, then sequences, then subjects"
 class Table:
     """A comparison that can be written in any format.
 
-    ``marking`` explains the ranks and their test (``tested``: whether there is one); ``part`` describes the part of the
+    ``marking`` explains the ranks and their test (``tested``: whether there is one), ``starred`` those of text, which marks
+    only the best; ``part`` describes the part of the
     frames, "" for all; ``missing`` explains why a task has no columns; ``name`` is the layout; ``cameras`` describes seen and
     unseen cameras, or why they are not shown separately; ``printed`` is the source of published values, with their conditions
     in further sentences; ``averaged`` describes the averaging.
@@ -104,6 +110,7 @@ class Table:
     tasks: tuple[TaskSummary, ...]
     seeds: int
     marking: str = ""
+    starred: str = ""
     image_size: str = ""
     machine: str = ""
     part: str = ""
@@ -138,18 +145,24 @@ class Table:
     @property
     def facts(self) -> tuple[str, ...]:
         """The sentences of the caption."""
+        return self.sentences(self.marking)
+
+    def sentences(self, marking: str, *, details: bool = True) -> tuple[str, ...]:
+        """What to know to read the table; with ``details`` also the protocols and how values were averaged."""
         parts = []
-        for task in self.tasks:
-            size = f"{counted(task.frames, 'frame')}, {counted(task.subjects, 'subject')}"
+        for task in self.tasks if details else ():
             name = f"{task.protocol_id} " if task.protocol_id else ""
-            parts.append(f"{task.title}: {size}, protocol {name}({task.protocol_hash}).")
+            parts.append(f"{task.title}: {task.size}, protocol {name}({task.protocol_hash}).")
         parts += [*self.missing, *filter(None, [self.cameras, self.part])]
         if self.image_size:
             parts.append(f"Images of {self.image_size} pixels.")
         spread = f"mean of {self.seeds} seeds ± standard deviation over seeds"
         seeds = spread if self.seeds > 1 else "one seed"
-        parts.append(f"Mean over {self.averaged}; {seeds}.")
-        parts += [self.marking] if self.marking else []
+        if details:
+            parts.append(f"Mean over {self.averaged}; {seeds}.")
+        elif self.seeds > 1:
+            parts.append(f"{spread.capitalize()}.")
+        parts += [marking] if marking else []
         parts += self.printed
         if any(column.metric == CODED_CHANGE.name for column in self.columns):
             parts.append("By coding: change of PSNR by the codec, in the task with the lower value.")
@@ -282,6 +295,7 @@ def build_table(
         for index, column in enumerate(columns)
     ]
     lines = _ranked(lines, columns, bests)
+    marking, starred = _marking(columns, lines, bests)
     groups = [
         (title, tuple(line for line in lines if titles[line.method] == title))
         for title in (METHODS_TITLE, SUSPECT_TITLE, CONDITIONS_TITLE, TRIVIAL_TITLE)
@@ -295,7 +309,8 @@ def build_table(
             for task in tasks
         ),
         seeds=max(1, len(rows.seeds(ALL))),
-        marking=_marking(columns, lines, bests),
+        marking=marking,
+        starred=starred,
         image_size=image_size,
         machine=measured_on(found.get("fps", {}), trivial, machine),
         part=part,
@@ -366,11 +381,13 @@ def _ranked(
     return [replace(line, cells=tuple(row)) for line, row in zip(lines, cells)]
 
 
-def _marking(columns: Sequence[Column], lines: Sequence[TableRow], bests: Sequence[BestSet | None]) -> str:
-    """Meaning of the marks of a table, and their test; "" if nothing is ranked."""
+def _marking(
+    columns: Sequence[Column], lines: Sequence[TableRow], bests: Sequence[BestSet | None]
+) -> tuple[str, str]:
+    """Meaning of the marks of a table and their test, and the same where only the best have a mark, an asterisk; "" if nothing is ranked."""
     ranks = {cell.rank for line in lines for cell in line.cells}
     if not ranks - {None}:
-        return ""
+        return "", ""
     tested = [best for best in bests if best is not None and best.methods is not None]
     untested = [(c, best) for c, best in zip(columns, bests) if best is not None and best.methods is None]
     places = ", ".join(["second underlined"] + ["third italic"] * (3 in ranks))
@@ -378,16 +395,13 @@ def _marking(columns: Sequence[Column], lines: Sequence[TableRow], bests: Sequen
     subjects = " or ".join(sorted(counts))
     if not tested:
         needed = max(best.needed for _, best in untested)
-        return (
-            f"Best bold, {places}, by the digits shown, without a test, which needs {needed} subjects"
-            f" (here {subjects})."
-        )
+        how = f"by the digits shown, without a test, which needs {needed} subjects (here {subjects})."
+        return f"Best bold, {places}, {how}", f"* Best {how}"
     test = f"exact sign-flip test over {subjects}, each method against all others, Holm, {LEVEL:.0%}"
-    text = (
-        f"Bold: every method that is not significantly worse than the best one, whatever its mean ({test}). The others by the digits "
-        f"shown: {places}."
-    )
+    best_of = f"very method that is not significantly worse than the best one, whatever its mean ({test})."
+    others = f" The others by the digits shown: {places}."
+    few = ""
     if untested:
         names = ", ".join(f"{column.title} {column.label}" for column, _ in untested)
-        text += f" Too few subjects for a test, ranked by the digits alone: {names}."
-    return text
+        few = f" Too few subjects for a test, ranked by the digits alone: {names}."
+    return f"Bold: e{best_of}{others}{few}", f"* E{best_of}{few}"

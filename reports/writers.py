@@ -14,10 +14,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..bench import terminal
 from ..bench.io.provenance import tool
 from ..bench.io.style import SHAPES, stylesheet
 from .compact import compact
-from .tables import TITLES, Column, Table, TableCell
+from .tables import METHODS_TITLE, TITLES, Column, Table, TableCell
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -66,55 +67,33 @@ def _markdown_cell(cell: TableCell) -> str:
     return text if cell.note is None else f"{text}<sup>{cell.note + 1}</sup>"
 
 
-RANK_STYLES = {1: "1", 2: "4", 3: "3"}
-"""Escape codes of terminals by rank: bold, underlined, italic."""
+def to_text(table: Table, *, details: bool = False, fit: bool = False) -> str:
+    """Write one aligned table for each task and one for the avatar, fitted to the terminal with ``fit``.
 
-
-def to_text(table: Table, *, styled: bool = False) -> str:
-    """Write aligned columns for a terminal, without Markdown; ``styled`` marks ranks as the caption says.
-
-    Two lines of headers: tasks over their columns, then metrics with units. Notes are numbered in brackets.
+    Only the best values are marked. With ``details``, the text below states protocols and how values were averaged.
     """
-    names = ["Method"]
-    for column in table.columns:
-        unit = f" ({column.unit})" if column.unit else ""
-        names.append(f"{column.label}{unit} {column.arrow}".rstrip())
-    lines: list[list[str]] = []
-    marks: dict[tuple[int, int], int] = {}
-    for title, rows in table.groups:
-        if table.titled:
-            lines.append([title])
-        for row in rows:
-            marks |= {
-                (len(lines), i): cell.rank for i, cell in enumerate(row.cells, 1) if cell.rank in RANK_STYLES
-            }
-            noted = ("" if cell.note is None else f" [{cell.note + 1}]" for cell in row.cells)
-            lines.append([row.method, *(f"{cell.shown}{note}" for cell, note in zip(row.cells, noted))])
-    full = [names, *(line for line in lines if len(line) > 1)]
-    widths = [max(len(line[i]) for line in full) for i in range(len(names))]
-    heads, start = [" " * widths[0]], 1
-    for title, count in _spans(table):
-        width = sum(widths[start : start + count]) + 2 * (count - 1)
-        if len(title) > width:
-            widths[start] += len(title) - width
-            width = len(title)
-        heads.append(title.center(width))
-        start += count
-
-    def shown(line: list[str], index: int = -1) -> str:
-        cells = [line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]
-        if styled:
-            for i, text in enumerate(cells):
-                if rank := marks.get((index, i)):
-                    bare = text.lstrip()
-                    cells[i] = f"{text[: len(text) - len(bare)]}\x1b[{RANK_STYLES[rank]}m{bare}\x1b[0m"
-        return "  ".join(cells).rstrip()
-
-    rule = "  ".join("-" * width for width in widths)
-    body = [line[0] if len(line) == 1 else shown(line, index) for index, line in enumerate(lines)]
-    text = "\n".join(["  ".join(heads).rstrip(), shown(names), rule, *body])
+    sizes = {task.title: f" ({task.size})" for task in table.tasks}
+    blocks = []
+    for title in dict.fromkeys(column.title for column in table.columns):
+        chosen = [i for i, column in enumerate(table.columns) if column.title == title]
+        heads = [_head(table.columns[i]) for i in chosen]
+        lines: list[list[str]] = []
+        for group, rows in table.groups:
+            lines += [[group]] if table.titled and group != METHODS_TITLE else []
+            lines += [[row.method, *(_text_cell(row.cells[i]) for i in chosen)] for row in rows]
+        blocks.append(terminal.table(["Method", *heads], lines, title=title + sizes.get(title, ""), fit=fit))
     notes = [f"[{i}] {note}" for i, note in enumerate(table.notes, 1)]
-    return "\n\n".join([text, table.caption, *(["\n".join(notes)] if notes else [])]) + "\n"
+    below = [*table.sentences(table.starred, details=details), *notes]
+    return "\n\n".join([*blocks, "\n".join(map(terminal.wrapped, below) if fit else below)]) + "\n"
+
+
+def _head(column: Column) -> str:
+    unit = f" ({column.unit})" if column.unit else ""
+    return f"{column.label}{unit} {column.arrow}"
+
+
+def _text_cell(cell: TableCell) -> str:
+    return cell.shown + " *" * (cell.rank == 1) + ("" if cell.note is None else f" [{cell.note + 1}]")
 
 
 LATEX_ESCAPES = {

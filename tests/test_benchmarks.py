@@ -55,7 +55,7 @@ def test_rows_become_a_table():
     rows = [{"name": "a", "ms": 1.23456}, {"name": "long", "ms": 12345.6, "count": 7}]
     assert table(rows).splitlines() == [
         "name     ms  count",
-        "----  -----  -----",
+        "----- ------ -----",
         "a      1.23      -",
         "long  12346      7",
     ]

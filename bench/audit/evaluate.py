@@ -207,7 +207,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
         cells = [(method, PLAIN)]
         rows = run_locked(config, cells=cells, metrics=metrics, clips=clips, each=score, unchecked=True)
     together = [*([Path(settings.like)] if settings.like else []), folder.root]
-    text = resolve(get("reports", "table-text").implementation)(together)
+    text = resolve(get("reports", "table-text").implementation)(together, fit=True)
     data = {"out": folder.root, "method": method.spec.name, "version": method.spec.version, "rows": len(rows)}
     return CommandResult(f"{text}\n{folder.root}", data, not rows.failed)
 

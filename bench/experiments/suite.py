@@ -115,7 +115,9 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
             text = resolve(get("reports", "suite").implementation)(out, OURS)
             write_text(out / "results.md", text)
     data = {"out": out, "runs": runs, "failed": sorted({*failed})}
-    return CommandResult("\n\n".join([f"{text}\n{out / 'results.md'}", *ends]), data, not failed)
+    return CommandResult(
+        "\n\n".join([f"Tables of all results: {out / 'results.md'}", *ends]), data, not failed
+    )
 
 
 def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:

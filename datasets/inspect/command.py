@@ -14,6 +14,7 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import write_json
 from ...bench.specs import CommandResult
+from ...bench.terminal import table
 from ..options import CaptureOptions
 
 if TYPE_CHECKING:
@@ -123,20 +124,20 @@ def _text(
     from .figure import space_summary
 
     lines = [f"subject {clip.subject}, head model {clip.head.version}, {len(clip.cameras)} cameras", ""]
-    lines.append(f"{'split':<18}{'images':>8}{'timesteps':>11}{'cameras':>9}{'sequences':>11}")
-    for row in splits:
-        lines.append(f"{row.split:<18}{row.images:>8}{row.timesteps:>11}{row.cameras:>9}{row.sequences:>11}")
-    width = max(len("sequence"), *(len(row.sequence) for row in sequences)) + 2
-    lines += ["", f"{'sequence':<{width}}{'timesteps':>9}{'jaw deg':>14}{'head deg':>10}{'head mm':>9}"]
-    lines[-1] += f"{'expression mm':>15}{'rms sigma':>11}"
-    for sequence in sequences:
-        low, _, high = sequence.jaw_deg
-        lines.append(
-            f"{sequence.sequence:<{width}}{sequence.timesteps:>9}{f'{low:.1f} to {high:.1f}':>14}"
-            f"{sequence.head_deg:>10.1f}{sequence.head_mm:>9.1f}{sequence.reach_mm[1]:>15.1f}"
-            f"{sequence.expression_sigma:>11.2f}" + ("  held out" if sequence.held_out else "")
+    counts = [
+        [row.split, *map(str, (row.images, row.timesteps, row.cameras, row.sequences))] for row in splits
+    ]
+    lines += [table(["split", "images", "timesteps", "cameras", "sequences"], counts), ""]
+    heads = "sequence, timesteps, jaw deg, head deg, head mm, expression mm, rms sigma"
+    motion = []
+    for row in sequences:
+        low, _, high = row.jaw_deg
+        head = (
+            f"{row.head_deg:.1f} {row.head_mm:.1f} {row.reach_mm[1]:.1f} {row.expression_sigma:.2f}".split()
         )
-    lines += ["", space_summary(space) + "."]
+        name = f"{row.sequence} (held out)" if row.held_out else row.sequence
+        motion.append([name, str(row.timesteps), f"{low:.1f} to {high:.1f}", *head])
+    lines += [table(heads.split(", "), motion), "", space_summary(space) + "."]
     if clip.steps and clip.steps[0].parameters.get("eyelids"):
         lines.append(f"Eyelids: {clip.steps[0].parameters['eyelids']}.")
     for name, found in space.novelty.items():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -19,9 +18,6 @@ from .settings import LintSettings
 
 if TYPE_CHECKING:
     from .evidence import Evidence
-
-
-_WIDTH = 100
 
 
 def lint(settings: LintSettings, progress: Progress = no_progress) -> CommandResult:
@@ -110,9 +106,8 @@ def _report(evidence: Evidence, findings: Sequence[Finding], passed: bool) -> st
     lines = []
     for finding in findings:
         place = finding.file + (f", {finding.key}" if finding.key else "")
-        lines += _filled(f"{finding.code} {finding.severity:<8}", finding.message)
-        lines += _filled("", place) if place else []
-        lines += [*_filled("", finding.remedy), ""]
+        lines.append(f"{finding.code} {finding.severity:<8}  {finding.message}")
+        lines += [f"{'':16}{text}" for text in (place, finding.remedy) if text] + [""]
     counts = Counter(finding.severity for finding in findings)
     found = ", ".join(counted(counts[severity], severity) for severity in SEVERITIES)
     seen = _looked_at(evidence)
@@ -125,21 +120,10 @@ def _report(evidence: Evidence, findings: Sequence[Finding], passed: bool) -> st
     ]
     if skipped := _skipped(evidence):
         text = "They look at files of the GaussianAvatars/VHAP layout, and another reader read this capture."
-        lines += _filled("", f"Skipped {counted(len(skipped), 'check')}: {', '.join(skipped)}. {text}")
+        lines.append(f"Skipped {counted(len(skipped), 'check')}: {', '.join(skipped)}. {text}")
     if not passed:
         lines.append("Not suitable for a comparison without changes.")
     return "\n".join(lines)
-
-
-def _filled(head: str, text: str) -> list[str]:
-    return textwrap.wrap(
-        text,
-        _WIDTH,
-        initial_indent=f"{head:<16}",
-        subsequent_indent=" " * 16,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
 
 
 def _explained() -> CommandResult:
@@ -150,8 +134,7 @@ def _explained() -> CommandResult:
         lines += [f"HB{digit}xx {group}", ""]
         for rule in RULES:
             if rule.code[2] == digit:
-                lines += _filled(f"{rule.code} {rule.severity:<8}", rule.title)
-                lines += _filled("", rule.remedy)
+                lines += [f"{rule.code} {rule.severity:<8}  {rule.title}", f"{'':16}{rule.remedy}"]
         lines.append("")
     data = {
         "rules": [

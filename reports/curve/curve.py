@@ -24,6 +24,7 @@ from ...bench.io.files import write_text
 from ...bench.manifest import ClipRecord, MethodRecord
 from ...bench.rows import ALL, Rows
 from ...bench.specs import CommandResult, MetricSpec
+from ...bench.terminal import table
 from ..aggregate import subject_means
 from ..plots import MARKERS, SMALL, cost_axis, plot_file, show_missing, start_axes
 from ..runs import RunData
@@ -208,7 +209,7 @@ def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult
     held_out = {subject: curve.held_out[subject] for subject in curve.subjects}
     text = points_text(curve.means, curve.metrics, curve.tasks, held_out, curve.missing, failed)
     written = f"Written: {out / 'curve.csv'}, {out / 'curve.png'}"
-    return CommandResult(f"{text}\n\n{leaders_text(curve)}\n\n{written}", data, not failed)
+    return CommandResult(f"{text}\n\n{leaders_text(curve, markdown=False)}\n\n{written}", data, not failed)
 
 
 @dataclass(frozen=True)
@@ -421,15 +422,15 @@ def _leaders(
     return found
 
 
-def leaders_text(curve: CurveData) -> str:
-    """The best methods by metric and held-out data, in a sentence and a table: Markdown."""
-    lines = [
-        ["", *(f"held-out {HELD_OUT[task]}" for task in curve.tasks)],
-        ["---"] * (1 + len(curve.tasks)),
-    ]
+def leaders_text(curve: CurveData, *, markdown: bool = True) -> str:
+    """The best methods by metric and held-out data, in a sentence and a table: Markdown, or for a terminal."""
+    heads = [f"held-out {HELD_OUT[task]}" for task in curve.tasks]
+    lines = []
     for spec in curve.of_frames:
         cells = ("; ".join(leader.text() for leader in curve.best[spec.name, task]) for task in curve.tasks)
         lines.append([spec.label, *(cell or "–" for cell in cells)])
+    rule = ["---"] * (1 + len(heads))
+    shown = pipe_table([["", *heads], rule, *lines]) if markdown else table(["metric", *heads], lines)
     taken = "limit of seconds" if curve.over == "seconds" else curve.axis.lower()
     crossings = (
         "95 % interval of each crossing in brackets"
@@ -438,7 +439,7 @@ def leaders_text(curve: CurveData) -> str:
     )
     return (
         f"Methods with the best mean, each with the {taken} from which it leads (interpolated between trainings, {crossings}):"
-        f"\n\n{pipe_table(lines)}"
+        f"\n\n{shown}"
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from ...bench.contracts import Budget
 from ...bench.specs import MetricSpec
+from ...bench.terminal import table
 from ..statistics.paired import LEAST_SUBJECTS, half_width
 
 HELD_OUT: Mapping[str, str] = {"novel_view": "camera", "self_reenactment": "timesteps"}
@@ -110,28 +111,30 @@ def points_text(
     failed: Sequence[str],
 ) -> str:
     """Means over subjects as a table, with the held-out data and the missing values."""
-    wide = max(8, *(len(point.method) + 2 for point in points))
     frame = [spec for spec in metrics if spec.per_frame]
     costs = {name for name, _ in MEASURED.values()}
     avatar = [spec for spec in metrics if not spec.per_frame and spec.name not in costs]
     tracked = any(point.tracking_error is not None for point in points)
-    group = 9 * len(frame)
-    head = "".join(f"{'held-out ' + HELD_OUT[task]:>{group}}" for task in tasks)
-    names = "".join(f"{spec.label:>9}" for _ in tasks for spec in frame)
-    names += "".join(f"{spec.label + (f' {spec.unit}' if spec.unit else ''):>12}" for spec in avatar)
-    columns = f"{'method':<{wide}}{'part':>7}{'budget':>10}{'cameras':>8}{'timesteps':>11}{'pictures':>10}"
-    columns += f"{'tracking':>10}" if tracked else ""
-    columns += f"{'CPU s':>10}{'s':>10}"
-    lines = [f"{'':<{len(columns)}}{head}", f"{columns}{names}"]
+    place = ["method", "part", "budget"]
+    heads = [*place, "cameras", "timesteps", "pictures", *["tracking"] * tracked, "CPU s", "s"]
+    heads += [f"{spec.label} {spec.unit}".rstrip() for spec in avatar]
+    trainings: list[list[str]] = []
+    quality: dict[str, list[list[str]]] = {task: [] for task in tasks if frame}
     for point in points:
         budget = point.budget
-        cells = [_shown(point.values[column(spec, task)], spec.digits, 9) for task in tasks for spec in frame]
-        cells += [_shown(point.values[spec.name], spec.digits, 12) for spec in avatar]
-        cost = [_shown(point.cost[key], 1, 10) for key in ("processor_seconds", "seconds")]
         size = f"{budget.seconds:g} s" if budget.iterations is None else f"{budget.iterations}"
-        given = f"{point.part!s:>7}{size:>10}{point.cameras:>8g}{point.timesteps:>11g}{point.pictures:>10g}"
-        given += _shown(point.tracking_error, 2, 10) if tracked else ""
-        lines.append(f"{point.method:<{wide}}{given}{''.join([*cost, *cells])}")
+        where = [point.method, str(point.part), size]
+        cells = [f"{count:g}" for count in (point.cameras, point.timesteps, point.pictures)]
+        cells += [_shown(point.tracking_error, 2)] * tracked
+        cells += [_shown(point.cost[key], 1) for key in ("processor_seconds", "seconds")]
+        cells += [_shown(point.values[spec.name], spec.digits) for spec in avatar]
+        trainings.append([*where, *cells])
+        for task, own in quality.items():
+            own.append([*where, *(_shown(point.values[column(spec, task)], spec.digits) for spec in frame)])
+    lines = [table(heads, trainings, names=3, title="Trainings"), ""]
+    for task, own in quality.items():
+        title = f"Quality, held-out {HELD_OUT[task]}"
+        lines += [table([*place, *(spec.label for spec in frame)], own, names=3, title=title), ""]
     lines.append("Means over subjects. Held out of every training; no test frame was used:")
     for subject, parameters in held.items():
         steps = ", ".join(map(str, parameters["timesteps"][:6])) + (
@@ -142,5 +145,5 @@ def points_text(
     return "\n".join([*lines, *(f"failed: {name}" for name in failed)])
 
 
-def _shown(value: float | None, digits: int, width: int) -> str:
-    return f"{'-' if value is None or not math.isfinite(value) else f'{value:.{digits}f}':>{width}}"
+def _shown(value: float | None, digits: int) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

@@ -12,6 +12,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_output_folder, write_text
 from ...bench.progress import counted
 from ...bench.specs import CommandResult
+from ...bench.terminal import table
 from .settings import ParetoSettings
 
 if TYPE_CHECKING:
@@ -121,14 +122,14 @@ def _text(
     digits: int,
     note: str,
 ) -> str:
-    wide = max([16, *(len(point.method) + 2 for point in points)])
-    lines = [f"{'method':<{wide}}{label:>10}{'MB':>12}{'ms':>12}  run (* on the front of size, of time)"]
+    rows = []
     for index, point in enumerate(points):
-        cells = [
-            f"{'-' if value is None else f'{value:.2f}':>10} {'*' if index in fronts[cost] else ' '}"
+        costs = [
+            f"{'-' if value is None else f'{value:.2f}'}{' *' if index in fronts[cost] else ''}"
             for cost, value in (("megabytes", point.megabytes), ("milliseconds", point.milliseconds))
         ]
-        lines.append(f"{point.method:<{wide}}{point.quality:>10.{digits}f}{''.join(cells)}  {point.run}")
+        rows.append([point.method, f"{point.quality:.{digits}f}", *costs, point.run])
+    lines = [table(["method", label, "MB", "ms", "run"], rows), "* On the front of size or time."]
     if any(point.derived_from for point in points):
         lines.append("METHOD+VARIANT was derived from the trained avatar, without training.")
     lines += [f"Frame times: {note}"] if note else []

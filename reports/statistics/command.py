@@ -18,6 +18,7 @@ from ...bench.options import DependentOptions
 from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import CommandResult, MetricSpec
+from ...bench.terminal import table
 
 if TYPE_CHECKING:
     from ..runs import RunSet
@@ -56,12 +57,22 @@ class CompareSettings(BaselineOptions):
     test."""
 
     format: Literal["text", "csv"] = "text"
-    """Format of the output; --json prints everything, including the difference of each subject."""
+    """Format of the output; csv adds uncorrected p-values and subjects won, --json also the difference of each subject."""
 
     dependent = (
         *DEPENDENT,
         DependentOptions(
-            ("against", "metrics", "trivial", "region", "sequences", "level", "equivalence", "format"),
+            (
+                "against",
+                "metrics",
+                "trivial",
+                "region",
+                "sequences",
+                "level",
+                "equivalence",
+                "format",
+                "details",
+            ),
             "baseline",
             False,
         ),
@@ -158,9 +169,15 @@ def compare_methods(
     if settings.format == "csv":
         text = _csv(every)
     else:
-        text = "\n\n".join(_text(spec, c, note_of(times.get(spec.name, {}))) for spec, c in found)
-        text = "\n\n".join(filter(None, [runs.cameras, runs.part, text]))
-    return CommandResult(text, {"level": settings.level, "comparisons": every})
+        blocks = [
+            _text(task, [(spec, own) for spec, own in found if own[0].task == task], settings.level)
+            for task in dict.fromkeys(task for task, _ in columns)
+        ]
+        notes = [f"{spec.label}: {note}" for spec in metrics if (note := note_of(times.get(spec.name, {})))]
+        below = [*_tests([*chain(*(own for _, own in found))]), *notes, runs.cameras, runs.part]
+        text = "\n\n".join([*blocks, "\n".join(filter(None, below))])
+    data = {"level": settings.level, "comparisons": every}
+    return CommandResult(text, data, verbatim=settings.format == "csv")
 
 
 def _pairs(runs: RunSet, against: str | None, trivial: bool) -> list[tuple[str, str]]:
@@ -211,34 +228,32 @@ def _csv(comparisons: Sequence[dict[str, Any]]) -> str:
     return csv_text(lines).rstrip()
 
 
-def _text(spec: MetricSpec, comparisons: Sequence[PairedComparison], note: str) -> str:
-    """One metric's comparisons as a table for a terminal, with a note below."""
+def _text(task: str, found: Sequence[tuple[MetricSpec, Sequence[PairedComparison]]], level: float) -> str:
+    """The comparisons of a task as a table for a terminal, those of a metric below each other."""
     from ..tables import AVATAR_TITLE
 
-    first = comparisons[0]
-    title = TASK_TITLES.get(first.task, first.task) if first.task else AVATAR_TITLE
-    unit = f"{spec.unit}, " if spec.unit else ""
-    better = "higher" if spec.higher_is_better else "lower"
-    family = max(c.family for c in comparisons)
-    head = f"{title}, {spec.label} ({unit}{better} is better)"
-    if family:
-        subjects = counted(max(c.subjects for c in comparisons), "subject")
-        head += f": {subjects}, exact sign-flip test, Holm over {counted(family, 'comparison')}"
-    confidence = f"{100 * (1 - first.level):g} % interval"
-    lines = [["first", "second", "first - second", confidence, "p", "Holm", "first better", ""]]
-    for c in comparisons:
-        if c.difference is None or c.p is None or c.p_holm is None:
-            lines.append([c.first, c.second, "-", "", "", "", "", f"{c.verdict}: {c.reason}"])
-            continue
-        # One digit more than the table, since differences are smaller than values.
-        digits = spec.digits + 1
-        bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f} {c.high:+.{digits}f}"
-        numbers = [f"{c.difference:+.{digits}f}", bounds, f"{c.p:.4f}", f"{c.p_holm:.4f}"]
-        verdict = "; ".join(filter(None, [c.verdict, equivalence_text(c, spec.unit)]))
-        lines.append([c.first, c.second, *numbers, f"{c.wins} of {c.subjects}", verdict])
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    body = [
-        "  ".join(t.ljust(w) if i in (0, 1, 7) else t.rjust(w) for i, (t, w) in enumerate(zip(line, widths)))
-        for line in lines
-    ]
-    return "\n".join([head, *(f"  {line}".rstrip() for line in [*body, *([note] if note else [])])])
+    lines = []
+    for spec, comparisons in found:
+        unit = f"{spec.unit}, " if spec.unit else ""
+        lines.append([f"{spec.label} ({unit}{'higher' if spec.higher_is_better else 'lower'} is better)"])
+        for c in comparisons:
+            name = f"{c.first} - {c.second}"
+            if c.difference is None or c.p is None or c.p_holm is None:
+                lines.append([name, "-", "", "", f"{c.verdict}: {c.reason}"])
+                continue
+            # One digit more than the table, since differences are smaller than values.
+            digits = spec.digits + 1
+            bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f} {c.high:+.{digits}f}"
+            verdict = "; ".join(filter(None, [c.verdict, equivalence_text(c, spec.unit)]))
+            lines.append([name, f"{c.difference:+.{digits}f}", bounds, f"{c.p_holm:.4f}", verdict])
+    heads = ["Methods", "Difference", f"{100 * (1 - level):g} % interval", "p", "Conclusion"]
+    return table(heads, lines, title=TASK_TITLES.get(task, task) or AVATAR_TITLE)
+
+
+def _tests(comparisons: Sequence[PairedComparison]) -> list[str]:
+    """How differences were tested, in a sentence; none if no difference was."""
+    tested = [c for c in comparisons if c.family]
+    subjects = counted(max((c.subjects for c in tested), default=0), "subject")
+    family = counted(max((c.family for c in tested), default=0), "comparison")
+    text = f"p: exact sign-flip test over {subjects}, with Holm's correction for the {family} of a metric and task."
+    return [text] if tested else []

@@ -43,7 +43,7 @@ def test_output_is_readable_in_every_encoding(monkeypatch, run, encoding):
 
 def test_help_and_version_are_found_by_their_usual_words(capsys):
     version = f"headbench {importlib.metadata.version('headbench')}\n"
-    shown = {"": "usage: headbench ", "help": "usage: headbench ", "help run": "usage: headbench run "}
+    shown = {"": "headbench compares", "help": "usage: headbench ", "help run": "usage: headbench run "}
     for words, text in (shown | {"version": version, "-V": version, "--version": version}).items():
         with suppress(SystemExit):
             assert cli.main(words.split()) == 0
@@ -98,25 +98,16 @@ def test_sizes_are_width_first():
             parse_size(text)
 
 
-@pytest.mark.parametrize(
-    ("words", "terminal", "pipes", "styles"),
-    [
-        ([], True, False, True),
-        ([], False, True, False),
-        (["--format", "md"], True, True, False),
-        (["--format", "text"], False, False, False),
-        (["--json"], True, False, False),
-    ],
-)
-def test_a_table_is_aligned_text_on_a_terminal(
-    capsys, monkeypatch, config, finished, words, terminal, pipes, styles
-):
+def test_formats_of_a_table_are_not_wrapped(capsys, monkeypatch, config, finished):
     finished(replace(config, methods=("toy_plugin:METHOD", "toy_plugin:MIRROR", "mean-image")))
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
-    assert cli.main(["table", config.out, *words]) == 0
-    printed = capsys.readouterr().out
-    assert ("|" in printed, "\x1b" in printed) == (pipes, styles)
-    assert ("<ins>" in printed) == pipes
+    monkeypatch.setenv("COLUMNS", "40")
+    for words in (["--format", "md"], ["--json"]):
+        texts = []
+        for terminal in (True, False):
+            monkeypatch.setattr(sys.stdout, "isatty", lambda terminal=terminal: terminal)
+            assert cli.main(["table", config.out, *words]) == 0
+            texts.append(capsys.readouterr().out)
+        assert texts[0] == texts[1]
 
 
 def test_a_benchmark_prints_a_table_or_json(capsys, tmp_path, monkeypatch):

@@ -38,25 +38,23 @@ def cells_of(line):
     return [c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]]
 
 
-def test_text_has_aligned_columns_and_no_markup(table):
-    text = to_text(table)
-    head, _, rest = text.partition("\n\n")
-    lines = head.splitlines()
-    rule = next(line for line in lines if set(line) == {"-", " "})
-    ends = [match.end() for match in re.finditer("-+", rule)]
-    for row in ("good", NASTY, "floor"):
-        (line,) = (line for line in lines if line.startswith(row))
-        assert len(line) == ends[-1]
-        assert all(line[end : end + 2].strip() == "" for end in ends[:-1])
-    assert NASTY in head
-    assert "[1] " in rest
-    assert not re.search(r"<ins>|<sup>|\*\*", text)
-
-
-def test_styles_of_a_terminal_mark_ranks(table):
-    styled = to_text(table, styled=True)
-    assert "\x1b[1m30.13\x1b[0m" in styled
-    assert re.sub(r"\x1b\[\d+m", "", styled) == to_text(table)
+def test_text_is_a_block_for_each_task(table):
+    *blocks, below = to_text(table).split("\n\n")
+    assert [block.split(" (")[0].split("\n")[0] for block in blocks] == [
+        "Novel view",
+        "Self-reenactment",
+        "Avatar",
+    ]
+    for block in blocks:
+        _, _, rule, *lines = block.splitlines()
+        start = len(rule.split(" ")[0])
+        assert [line[:start].strip() for line in lines[:2]] == ["good", NASTY]
+        assert lines[2:3] == ["Trivial baselines (not ranked)"]
+    assert re.search(r"good +30.13 \* +30.126\n", blocks[0])
+    assert re.search(r"25.50 +– \[1\]", blocks[0])
+    assert "[1] No 100% weights_file." in below
+    assert "hash-novel" not in below
+    assert "hash-novel" in to_text(table, details=True)
 
 
 def test_markdown_is_a_table_of_equal_lines(table):

@@ -31,7 +31,6 @@ from ....bench.progress import log_to_file
 from ....bench.registry import get
 from ....bench.rows import Rows
 from ....bench.specs import CommandResult
-from ....bench.streams import on_terminal
 from ...flashavatar.config import FlashAvatarConfig
 from ...rgbavatar.config import RGBAvatarConfig
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
@@ -161,8 +160,8 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
     changed = sorted({line for cell in cells[official] for line in cell["differences"]})
     causes = [*CAUSES[settings.method], *changed]
     parts = (settings, native, official, differences, cells, causes, rows)
-    write_text(out / "parity.md", _text(*parts))
-    text = _text(*parts, markdown=not on_terminal())
+    write_text(out / "parity.md", _text(*parts, markdown=True))
+    text = _text(*parts, markdown=False)
     data = {
         "native": native,
         "official": official,
@@ -355,7 +354,7 @@ def _text(
     causes: Sequence[str],
     rows: Rows,
     *,
-    markdown: bool = True,
+    markdown: bool,
 ) -> str:
     lines = [
         f"{'# ' if markdown else ''}{native} and {official}, {settings.iterations:,} iterations each",

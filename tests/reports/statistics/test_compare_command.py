@@ -40,15 +40,15 @@ def folder(tmp_path, write_manifest):
 
 def test_text_tells_size_interval_test_and_verdict(folder):
     text = compare_runs(CompareSettings((str(folder),))).text
-    novel, reenacted, size = text.split("\n\n")
-    head, names, line = novel.splitlines()
-    assert head == (
-        "Novel view, Error (levels, lower is better): 7 subjects, exact sign-flip test, Holm over 1 comparison"
-    )
-    assert names.split("  ")[1] == "first"
+    novel, reenacted, size, how = text.split("\n\n")
+    head, names, _, metric, line = novel.splitlines()
+    assert (head, metric) == ("Novel view", "Error (levels, lower is better)")
     assert "95 % interval" in names
+    assert how.startswith(
+        "p: exact sign-flip test over 7 subjects, with Holm's correction for the 1 comparison "
+    )
     # Mean of 2 (1 + s/10) over seven subjects: 2.6, good below bad; all of one sign: p = 2/2^7.
-    for part in ("good", "bad", "-2.600", "0.0156", "7 of 7", "good is better"):
+    for part in ("good - bad", "-2.600", "0.0156", "good is better"):
         assert part in line
     assert reenacted.startswith("Self-reenactment")
     assert "+0.000" in size
@@ -83,9 +83,8 @@ def test_speeds_that_do_not_compare_have_a_note(folder, change_manifest, bad, fl
         rows.loc[own, list(given)] = list(given.values())
     Rows(rows).write(RunFolder(folder).rows)
     found = compare_runs(CompareSettings((str(folder),)))
-    *errors, size = found.text.split("\n\n")
-    assert size.splitlines()[3:] == ([f"  {note}"] if note else [])
-    assert all("Measured" not in text for text in errors)
+    assert found.text.splitlines()[-1:] == ([f"Size: {note}"] if note else found.text.splitlines()[-1:])
+    assert found.text.count("Measured") == note.count("Measured")
     assert [c["note"] for c in found.data["comparisons"]] == ["", "", note]
     text = compare_runs(CompareSettings((str(folder),), format="csv")).text
     assert [line["note"] for line in csv.DictReader(io.StringIO(text))] == ["", "", note]
@@ -158,7 +157,7 @@ def test_equivalence_is_tested_where_a_margin_is_given(folder):
         compare_runs(CompareSettings((str(folder),), equivalence=(f"error={margin}",)))
         for margin in ("4", "2.5")
     )
-    novel, reenacted, size = wide.text.split("\n\n")
+    novel, reenacted, size, _ = wide.text.split("\n\n")
     for text in (novel, reenacted):
         assert "good is better; equivalent within 4 levels (Holm 0.0078)" in text
     assert "equivalen" not in size
