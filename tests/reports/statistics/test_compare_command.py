@@ -44,9 +44,7 @@ def test_text_tells_size_interval_test_and_verdict(folder):
     head, names, _, metric, line = novel.splitlines()
     assert (head, metric) == ("Novel view", "Error (levels, lower is better)")
     assert "95 % interval" in names
-    assert how.startswith(
-        "p: exact sign-flip test over 7 subjects, with Holm's correction for the 1 comparison "
-    )
+    assert how.startswith("p: exact sign-flip test over 7 subjects, with Holm's correction for ")
     # Mean of 2 (1 + s/10) over seven subjects: 2.6, good below bad; all of one sign: p = 2/2^7.
     for part in ("good - bad", "-2.600", "0.0156", "good is better"):
         assert part in line
