@@ -81,7 +81,7 @@ def test_speeds_that_do_not_compare_have_a_note(folder, change_manifest, bad, fl
         rows.loc[own, list(given)] = list(given.values())
     Rows(rows).write(RunFolder(folder).rows)
     found = compare_runs(CompareSettings((str(folder),)))
-    assert found.text.splitlines()[-1:] == ([f"Size: {note}"] if note else found.text.splitlines()[-1:])
+    assert found.text.splitlines()[-1:] == ([f"Error: {note}"] if note else found.text.splitlines()[-1:])
     assert found.text.count("Measured") == note.count("Measured")
     assert [c["note"] for c in found.data["comparisons"]] == ["", "", note]
     text = compare_runs(CompareSettings((str(folder),), format="csv")).text
