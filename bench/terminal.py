@@ -24,9 +24,8 @@ _GROUP = "\0"
 
 def width_of(stream: TextIO | None) -> int | None:
     """Characters of a line of a stream, by default of standard output; None if it is no terminal."""
-    stream = (
-        getattr(sys.stdout, "rich_proxied_file", sys.stdout) if stream is None else stream
-    )  # behind progress
+    # A display of progress replaces standard output.
+    stream = stream or getattr(sys.stdout, "rich_proxied_file", sys.stdout)
     return max(40, shutil.get_terminal_size().columns) if stream.isatty() else None
 
 
