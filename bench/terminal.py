@@ -11,7 +11,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Sequence
-from typing import TextIO
+from typing import Any, TextIO
 
 LEAST = 16
 """Characters below which a column of text is not narrowed."""
@@ -25,8 +25,8 @@ _GROUP = "\0"
 def width_of(stream: TextIO | None) -> int | None:
     """Characters of a line of a stream, by default of standard output; None if it is no terminal."""
     # A display of progress replaces standard output.
-    stream = stream or getattr(sys.stdout, "rich_proxied_file", sys.stdout)
-    return max(40, shutil.get_terminal_size().columns) if stream.isatty() else None
+    used: Any = stream or getattr(sys.stdout, "rich_proxied_file", sys.stdout)
+    return max(40, shutil.get_terminal_size().columns) if used.isatty() else None
 
 
 def wrapped(text: str, stream: TextIO | None = None) -> str:
