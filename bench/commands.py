@@ -30,10 +30,6 @@ _ALIASES = {
 COMMAND_ALIASES = {word: name for name, words in _ALIASES.items() for word in words.split()}
 """Command names of other toolkits, and the equivalent command of headbench."""
 
-ABOUT = (
-    "Benchmark of animatable 3D head avatars. Start with `headbench demo`. `headbench COMMAND --help` explains a command, "
-    "`headbench --version` prints the version."
-)
 START = """\
 headbench compares methods that make animatable 3D avatars of heads from videos. Every method is trained on the same \
 recordings and scored on the same frames that it has not seen: image quality, size, speed.
@@ -93,7 +89,7 @@ def call(words: Sequence[str]) -> int:
 def help_page(plugins: Mapping[str, Plugin]) -> str:
     """List commands by group (`COMMAND_GROUPS` first), then `FIRST`, then by name; two-word commands are nested."""
     width = max(map(len, plugins)) + 2
-    lines = ["usage: headbench COMMAND [OPTIONS]", "", ABOUT]
+    lines = ["usage: headbench COMMAND [OPTIONS]", "", "`headbench COMMAND --help` explains a command."]
     groups: dict[str, list[str]] = {group: [] for group in COMMAND_GROUPS}
     for name, plugin in sorted(plugins.items(), key=lambda item: (_place(item[0]), item[0])):
         group, summary = ("broken", "It cannot be loaded; calling it shows why.")

@@ -11,7 +11,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Sequence
-from typing import TextIO
+from typing import Any, TextIO
 
 LEAST = 16
 """Characters below which a column of text is not narrowed."""
@@ -22,20 +22,16 @@ _GROUP = "\0"
 """Drawn between groups of rows, until their title replaces it."""
 
 
-def _stdout() -> TextIO:
-    """Standard output, also while a display of progress has replaced it."""
-    stream: TextIO = getattr(sys.stdout, "rich_proxied_file", sys.stdout)
-    return stream
-
-
-def width_of(stream: TextIO) -> int | None:
-    """Characters of a line; None if there is no limit."""
-    return max(40, shutil.get_terminal_size().columns) if stream.isatty() else None
+def width_of(stream: TextIO | None) -> int | None:
+    """Characters of a line of a stream, by default of standard output; None if it is no terminal."""
+    # A display of progress replaces standard output.
+    used: Any = stream or getattr(sys.stdout, "rich_proxied_file", sys.stdout)
+    return max(40, shutil.get_terminal_size().columns) if used.isatty() else None
 
 
 def wrapped(text: str, stream: TextIO | None = None) -> str:
     """Wrap long lines between words. They continue below their text, after a bullet and columns at the beginning."""
-    width = width_of(stream or _stdout())
+    width = width_of(stream)
     return text if width is None else "\n".join(_wrapped(line, width) for line in text.split("\n"))
 
 
@@ -62,8 +58,8 @@ def table(
     from rich.table import Table
     from rich.text import Text
 
-    width = (width_of(_stdout()) if fit else None) or UNLIMITED
-    styled = fit and _stdout().isatty() and not os.environ.get("NO_COLOR")
+    limit = width_of(None) if fit else None
+    styled, width = bool(limit and not os.environ.get("NO_COLOR")), limit or UNLIMITED
     # Without a height, a dumb terminal has 80 columns.
     console = Console(width=width, height=25, force_terminal=styled, highlight=False)
     ruled = Box(f"    \n    \n -  \n    \n {_GROUP}  \n    \n    \n    \n", ascii=True)

@@ -249,13 +249,11 @@ def _text(
                     cells.append(f"{own[key] - base[key]:+.{QUALITY[metric]}f}")
             if set(cells) != {"–"}:
                 lines.append([label, *cells])
-        rule = [":--", *("--:" for _ in columns)]
-        title = TASK_TITLES[task]
-        shown = (
-            f"### {title}\n\n{pipe_table([head, rule, *lines])}"
-            if markdown
-            else table(head, lines, title=title)
-        )
+        if markdown:
+            rule = [":--", *("--:" for _ in columns)]
+            shown = f"### {TASK_TITLES[task]}\n\n{pipe_table([head, rule, *lines])}"
+        else:
+            shown = table(head, lines, title=TASK_TITLES[task])
         spans = [
             max(found) - min(found)
             for m in methods

@@ -180,7 +180,7 @@ EVERY_METHOD = "(?s)ga .*gbs .*gha .*insta .*ours "
 CASES = {
     "demo": [],  # the run of this module
     "synth": [case(OTHERS, "others", "others/synthesis.json")],
-    "run": [case(PLAIN, r"\| nearest-camera", "plain/rows.parquet", "plain/tables/comparison.md")],
+    "run": [case(PLAIN, "(?m)^nearest-camera", "plain/rows.parquet", "plain/tables/comparison.md")],
     "status": [case("status plain", "2 cells: 0 waiting, 0 running, 2 done, 0 failed")],
     "run suite": [
         case(
@@ -200,7 +200,7 @@ CASES = {
         *(case(f"table {{demo}} --layout {layout}", mark) for layout, mark in LAYOUTS.items()),
         case("table {demo} --as tensorial-2025 --table 4", "Printed in Table 4"),
         case("table {demo} --protocol suite", "Protocol suite: The suite of headbench"),
-        case("table {demo} plain", "one seed"),
+        case("table {demo} plain --details", "one seed"),
         case("table {demo} --columns psnr novel_view --digits 1 --out t.tex", "t.tex", "t.tex"),
         case("table {demo} --region face --sequences FREE", "Region: face. Sequences: FREE."),
     ],
@@ -215,8 +215,8 @@ CASES = {
     "view": [case("view {demo} --port 0 --seconds 0", "the viewer of .*ours-plus has ended")],
     "verify": [case("verify plain --render", "as recorded")],
     "compare": [
-        case("compare {demo} --metrics psnr", "ga +ours"),
-        case("compare {demo} --metrics psnr --region face", "(?s)Region: face.*ga +ours"),
+        case("compare {demo} --metrics psnr", "ga - ours"),
+        case("compare {demo} --metrics psnr --region face", "(?s)ga - ours.*Region: face"),
         case("compare {demo} --metrics psnr ssim --against ours --trivial --format csv", "ours"),
         case("compare {demo} --metrics psnr --equivalence psnr=0.3", "equivalence within 0.3 dB not shown"),
         case("compare {demo} --baseline demo.json --update", "numbers written", "demo.json"),

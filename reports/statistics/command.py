@@ -174,7 +174,9 @@ def compare_methods(
             for task in dict.fromkeys(task for task, _ in columns)
         ]
         notes = [f"{spec.label}: {note}" for spec in metrics if (note := note_of(times.get(spec.name, {})))]
-        below = [*_tests([*chain(*(own for _, own in found))]), *notes, runs.cameras, runs.part]
+        subjects = counted(max(c.subjects for _, own in found for c in own), "subject")
+        how = f"p: exact sign-flip test over {subjects}, with Holm's correction for all pairs of a metric and task."
+        below = [how, *notes, runs.cameras, runs.part]
         text = "\n\n".join([*blocks, "\n".join(filter(None, below))])
     data = {"level": settings.level, "comparisons": every}
     return CommandResult(text, data, verbatim=settings.format == "csv")
@@ -248,12 +250,3 @@ def _text(task: str, found: Sequence[tuple[MetricSpec, Sequence[PairedComparison
             lines.append([name, f"{c.difference:+.{digits}f}", bounds, f"{c.p_holm:.4f}", verdict])
     heads = ["Methods", "Difference", f"{100 * (1 - level):g} % interval", "p", "Conclusion"]
     return table(heads, lines, title=TASK_TITLES.get(task, task) or AVATAR_TITLE)
-
-
-def _tests(comparisons: Sequence[PairedComparison]) -> list[str]:
-    """How differences were tested, in a sentence; none if no difference was."""
-    tested = [c for c in comparisons if c.family]
-    subjects = counted(max((c.subjects for c in tested), default=0), "subject")
-    family = counted(max((c.family for c in tested), default=0), "comparison")
-    text = f"p: exact sign-flip test over {subjects}, with Holm's correction for the {family} of a metric and task."
-    return [text] if tested else []

@@ -183,8 +183,8 @@ def test_every_truncation_is_refused(tmp_path, name):
     [
         *(("ab/3.png", "../3.png", "image 3, name"), ("ab/3.png", "/3.png", "image 3, name")),
         *(("ab/5.png", "ab/3.png", "again"), ("\n5 ", "\n3 ", "each image once")),
-        *((" 7 ab/3.png", " 8 ab/3.png", "image 3, camera"), (" 7 ab/3.png", " 7", "10 words")),
-        *(("\n3 ", "\n3 nan ", "numbers"), ("\n3 ", "\nx ", "numbers")),
+        *((" 7 ab/3.png", " 8 ab/3.png", "image 3, camera"), (" 7 ab/3.png", " 7", "ten words")),
+        *(("\n3 ", "\n3 nan ", "ten words"), ("\n3 ", "\nx ", "ten words")),
     ],
 )
 def test_faults_in_a_text_model_are_named(tmp_path, find, put, found):

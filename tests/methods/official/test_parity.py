@@ -2,7 +2,6 @@
 
 import math
 import re
-import sys
 from dataclasses import replace
 
 import pytest
@@ -48,11 +47,11 @@ def parity(*words):
     return cli.main([*line.split(), *words])
 
 
-def test_both_are_trained_and_their_difference_tabled(folder, capsys, monkeypatch):
+def test_both_are_trained_and_their_difference_tabled(folder, capsys):
     words = ("--iterations", "5", "--orders", "1", "--tolerance", "200")
     assert parity(*words) == 0
     text = (folder / "out" / "parity.md").read_text()
-    assert capsys.readouterr().out.strip() == text.strip()
+    assert not re.search(r"[|#]|\*\*", capsys.readouterr().out)
     assert re.search(r"\| novel view \| PSNR \| all \| all \| .*\*\*[+-][\d.]+\*\*", text)
     assert OFFICIAL in text
     assert "not the original" in text
@@ -66,9 +65,7 @@ def test_both_are_trained_and_their_difference_tabled(folder, capsys, monkeypatc
     assert any("order in which the native method" in line for line in record["differences"])
     # Again: nothing is trained anew, and another tolerance has another verdict.
     log = (avatar / "training.log").read_bytes()
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     assert parity(*words[:-1], "0.001") == 1
-    assert not re.search(r"[|#]|\*\*", capsys.readouterr().out)
     assert (avatar / "training.log").read_bytes() == log
 
 

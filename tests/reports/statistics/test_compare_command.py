@@ -44,9 +44,7 @@ def test_text_tells_size_interval_test_and_verdict(folder):
     head, names, _, metric, line = novel.splitlines()
     assert (head, metric) == ("Novel view", "Error (levels, lower is better)")
     assert "95 % interval" in names
-    assert how.startswith(
-        "p: exact sign-flip test over 7 subjects, with Holm's correction for the 1 comparison "
-    )
+    assert how.startswith("p: exact sign-flip test over 7 subjects, with Holm's correction for ")
     # Mean of 2 (1 + s/10) over seven subjects: 2.6, good below bad; all of one sign: p = 2/2^7.
     for part in ("good - bad", "-2.600", "0.0156", "good is better"):
         assert part in line
@@ -83,7 +81,7 @@ def test_speeds_that_do_not_compare_have_a_note(folder, change_manifest, bad, fl
         rows.loc[own, list(given)] = list(given.values())
     Rows(rows).write(RunFolder(folder).rows)
     found = compare_runs(CompareSettings((str(folder),)))
-    assert found.text.splitlines()[-1:] == ([f"Size: {note}"] if note else found.text.splitlines()[-1:])
+    assert found.text.splitlines()[-1:] == ([f"Error: {note}"] if note else found.text.splitlines()[-1:])
     assert found.text.count("Measured") == note.count("Measured")
     assert [c["note"] for c in found.data["comparisons"]] == ["", "", note]
     text = compare_runs(CompareSettings((str(folder),), format="csv")).text
