@@ -103,6 +103,7 @@ def install(site):
     ignored = shutil.ignore_patterns("__pycache__", "*.so")
     for folder in FOLDERS:
         shutil.copytree(ROOT / folder, site / "headbench" / folder, ignore=ignored)
+    shutil.copy(ROOT / "__init__.py", site / "headbench")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     about = site / f"headbench-{project['version']}.dist-info"
     about.mkdir()
