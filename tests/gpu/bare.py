@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("bench", "datasets", "methods", "metrics", "reports", "tests")
 # fmt: off
 NAMES = (
-    "annotated-types", "docstring-parser", "gsplat", "jaxtyping", "joblib", "markdown-it-py", "mdurl",
+    "annotated-types", "cloudpickle", "docstring-parser", "gsplat", "jaxtyping", "joblib", "markdown-it-py", "mdurl",
     "nanobind", "narwhals", "psutil", "pydantic", "pydantic-core", "pygments", "pyyaml", "rich",
     "safetensors", "scikit-learn", "scipy", "threadpoolctl", "typeguard", "typing-extensions",
     "typing-inspection", "tyro", "wadler-lindig"
