@@ -202,7 +202,7 @@ def speed(device: str, folder: Path, report: Report) -> None:
     report(Bar(f"both passes of the rasteriser, {what}: ms", 1e3 * medians["ours"]))
     if large:
         report(Bar("rasteriser: time over that of bare gsplat", medians["ours"] / medians["bare"], 1.05))
-    # Splats are not seen to multiply in so few iterations: ga starts with one a triangle, the rest follows from the preset.
+    # Training at the preset demo, of at most 20,000 splats: ga starts with one a triangle.
     clip = with_images(*untrained(count, width, height, cameras=2, timesteps=4))
     for name in ("ga", "ours"):
         spec = discover("methods")[name].spec
