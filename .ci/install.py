@@ -135,7 +135,9 @@ def main(folder, build=""):
         )
         if made.returncode:
             lines = (made.stdout + made.stderr).split()
-            raise Failed(f"{sys.executable} cannot make an environment in {folder}: {' '.join(lines)}")
+            raise Failed(
+                f"{sys.executable} cannot make an environment in {folder}: {' '.join(lines).rstrip('.')}"
+            )
     (folder / "install.log").unlink(missing_ok=True)
     to = Installer(folder)
     if not build:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from ...bench.contracts import ByteArray, FloatArray, IntArray
@@ -63,4 +62,6 @@ _LEVELS = 16384.0  # of stored values, so that blurred images are not rounded to
 
 
 def _blurred(levels: FloatArray, sigma: float) -> FloatArray:
+    import cv2  # not everywhere where methods are trained
+
     return np.asarray(cv2.GaussianBlur(levels, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE))

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("bench", "datasets", "methods", "metrics", "reports", "tests")
 # fmt: off
 NAMES = (
-    "annotated-types", "docstring-parser", "gsplat", "jaxtyping", "joblib", "markdown-it-py", "mdurl",
+    "annotated-types", "cloudpickle", "docstring-parser", "gsplat", "jaxtyping", "joblib", "markdown-it-py", "mdurl",
     "nanobind", "narwhals", "psutil", "pydantic", "pydantic-core", "pygments", "pyyaml", "rich",
     "safetensors", "scikit-learn", "scipy", "threadpoolctl", "typeguard", "typing-extensions",
     "typing-inspection", "tyro", "wadler-lindig"
@@ -103,6 +103,7 @@ def install(site):
     ignored = shutil.ignore_patterns("__pycache__", "*.so")
     for folder in FOLDERS:
         shutil.copytree(ROOT / folder, site / "headbench" / folder, ignore=ignored)
+    shutil.copy(ROOT / "__init__.py", site / "headbench")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     about = site / f"headbench-{project['version']}.dist-info"
     about.mkdir()

@@ -8,7 +8,6 @@ import types
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -20,44 +19,13 @@ from headbench.bench.engine import config as runner_config
 from headbench.bench.engine import job, measuring, training
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.store import RunFolder
-from headbench.bench.errors import HeadbenchError, InputError, reason_of
+from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.documents import read_json
-from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
 from headbench.bench.registry import Plugin
 from headbench.bench.rows import Rows
 from headbench.bench.specs import ReportSpec
 from headbench.reports.tables import METHODS_TITLE, SUSPECT_TITLE, build_table
-
-
-@pytest.mark.parametrize(
-    "error", [MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory")]
-)
-def test_out_of_memory_is_an_outcome_of_that_name(error):
-    assert reason_of(error).startswith("out of memory: ")
-    assert reason_of(ValueError("5")) == "ValueError: 5"
-
-
-def test_losses_are_written_as_csv_and_for_tensorboard(config, toy, monkeypatch):
-    original, written = toy.ToyMethod.fit, []
-
-    def fit(self, clip, out, *arguments, **options):
-        original(self, clip, out, *arguments, **options)
-        write_json(out / "training.json", {"losses": [[1, 0.5], [2, 0.25]]})
-
-    class Writer(nullcontext):
-        def __enter__(self):
-            return self
-
-        def add_scalar(self, name, value, step):
-            written.append((name, value, step))
-
-    monkeypatch.setattr(toy.ToyMethod, "fit", fit)
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer))
-    runner.run(config)
-    (losses,) = Path(config.out).glob("*/toy/seed-0/losses.csv")
-    assert losses.read_text() == "iteration,loss\n1,0.5\n2,0.25\n"
-    assert written == [("loss", 0.5, 1), ("loss", 0.25, 2)]
 
 
 @pytest.fixture
