@@ -107,7 +107,9 @@ class StoredResults:
     def demo(self) -> str:
         """The table of the demo, with the digits that do not depend on the processor, and its cost."""
         runs, record = self.read(self.gallery), RunFolder(self.gallery).read_manifest()
-        table = to_markdown(table_of(runs, columns=Columns((), ("psnr=1", "ssim=3", "lpips=3", "fps=0"))))
+        digits = {"psnr": 1, "ssim": 3, "lpips": 3, "fps": 0}
+        shown = tuple(f"{m.name}={digits[m.name]}" for m in runs.metrics if m.name in digits)
+        table = to_markdown(table_of(runs, columns=Columns((), shown)))
         minutes = ", ".join(
             f"{name} {m:.1f}"
             for name, m in stored_blocks.trainings(runs, "training_time")

@@ -47,6 +47,7 @@ INSTA = MethodSpec(
     needs="headbench.methods.shared.needs:insta",
     presets={
         "smoke": {"budget": {"iterations": 40}, **SHORT},
+        "quick": {"budget": {"iterations": 100}, **SHORT},
         "demo": {"budget": {"iterations": 400}, **SHORT},
         "fast": {
             "budget": {"iterations": 1_050},

@@ -37,7 +37,7 @@ SPECS = {
     spec.name: spec
     for spec in (FLASHAVATAR, OURS, GA, GBS, GHA, INSTA, RGBAVATAR, MEAN_IMAGE, NEAREST_CAMERA)
 }
-PRESETS = ("smoke", "demo", "fast", "gpu", "paper")
+PRESETS = ("smoke", "quick", "demo", "fast", "gpu", "paper")
 
 
 @pytest.mark.parametrize("name", SPECS)
@@ -99,7 +99,7 @@ def test_paper_presets_are_the_published_values():
     assert values(published.lines, "start", "lr", "network_lr") == (60_000, 2e-3, 1e-4)
 
 
-@pytest.mark.parametrize("preset", ["smoke", "demo", "fast"])
+@pytest.mark.parametrize("preset", ["smoke", "quick", "demo", "fast"])
 def test_short_presets_share_rates_that_paper_leaves_alone(preset):
     ga, gbs, ours = (resolve_method(spec, preset, {}).config for spec in (GA, GBS, OURS))
     assert values(ga.splats, *RATES) == values(ours.splats, *RATES) == (0.2, 1e-3, 0.05, 0.05, 0.01)
@@ -125,7 +125,7 @@ def test_the_paper_preset_of_gha_is_the_published_design():
     rule = paper.spec.resolution
     assert (rule.square, rule.size, rule.speed_size) == ("pad", (2048, 2048), (1024, 1024))
     assert 2048 / paper.config.upscale == 512
-    for preset in ("smoke", "demo", "fast"):
+    for preset in ("smoke", "quick", "demo", "fast"):
         assert resolve_method(GHA, preset, {}).spec.resolution.native
 
 
