@@ -120,7 +120,7 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
             make(**config.capture_arguments(), progress=report)
         execution = Execution("processes") if beside else None
         result = _run(comparison, execution, capture_seconds=round(time.perf_counter() - start, 3))
-    return replace(result, text=f"{result.text}\n{ONE_SUBJECT}")
+    return result._replace(text=f"{result.text}\n{ONE_SUBJECT}")
 
 
 @dataclass(frozen=True)

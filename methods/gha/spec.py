@@ -58,7 +58,7 @@ SHORT_PRESETS: dict[str, dict[str, Any]] = {
         "motion_steps": 200,
     },
     "quick": {
-        "budget": {"iterations": 220},
+        "budget": {"iterations": 200},
         **SHORT,
         "start_steps": 200,
         "motion_steps": 400,

@@ -69,6 +69,18 @@ def test_insta_is_refused_on_a_gpu_before_any_work(tmp_path):
     assert set(everywhere) - set(on_gpus) == {"insta"}
 
 
+def test_the_quick_demo_has_the_methods_of_the_long_one_without_speed():
+    quick, long = DemoConfig(), DemoConfig(preset="demo")
+    short, full = (demo_run_config(config, "cpu") for config in (quick, long))
+    assert short["methods"] == full["methods"]
+    left_out = set(full["metrics"]) - set(short["metrics"])
+    assert "fps" in left_out
+    assert not left_out & {"psnr", "ssim", "lpips", "storage", "training_time"}
+    assert quick.capture_arguments()["timesteps"] < long.capture_arguments()["timesteps"]
+    given = replace(quick, cameras=3, size="48x64").capture_arguments()
+    assert (given["cameras"], given["size"]) == (3, (48, 64))
+
+
 @pytest.mark.parametrize("name", SPECS)
 def test_a_run_records_the_version_of_the_method_that_it_runs(name):
     spec = SPECS[name]
