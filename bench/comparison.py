@@ -66,9 +66,9 @@ class DemoSettings:
     out: str = "demo-output"
     """Output folder."""
     preset: Preset = QUICK
-    """Length of the training. quick: about 3 minutes in all; demo: about 16 minutes, with more and larger images, and with
-    compressed avatars; smoke: about a minute, for a test of the installation, too short for good images; fast and paper: hours,
-    see `headbench list presets`."""
+    """Length of the training. quick: about 3 minutes in all; demo: about 16 minutes, with more and larger images, the
+    speed of the avatars, and compressed ones; smoke: about a minute, for a test of the installation, too short for good images; fast
+    and paper: hours, see `headbench list presets`."""
     seed: int = 0
     """Seed of the training."""
     set: Assignments = ()
@@ -79,8 +79,8 @@ class DemoSettings:
 DURATIONS = {"smoke": "about a minute", QUICK: "about 3 minutes", "demo": "about 16 minutes"}
 """How long the demo takes on two cores, by preset."""
 ONE_SUBJECT = (
-    "One head, trained on for so short a time, does not rank methods: their order changes with the subject, the seed and the length of "
-    "the training. `headbench run suite` compares them on ten."
+    "One subject ranks nobody: the order of the methods changes with the subject, the seed and the length of the training. "
+    "`headbench run suite` compares them on ten."
 )
 
 
