@@ -69,7 +69,7 @@ def test_insta_is_refused_on_a_gpu_before_any_work(tmp_path):
     assert set(everywhere) - set(on_gpus) == {"insta"}
 
 
-def test_the_quick_demo_has_the_methods_of_the_long_one_without_speed():
+def test_the_quick_demo_has_all_methods_and_no_speed():
     quick, long = DemoConfig(), DemoConfig(preset="demo")
     short, full = (demo_run_config(config, "cpu") for config in (quick, long))
     assert short["methods"] == full["methods"]
