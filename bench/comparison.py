@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shlex
 import time
@@ -18,6 +19,7 @@ from .condition import PLAIN
 from .configuration import build, merge, parse_assignments, with_homes
 from .contracts import Progress
 from .engine.config import (
+    QUICK,
     DemoConfig,
     RunConfig,
     build_run_config,
@@ -37,7 +39,7 @@ from .io.files import (
 )
 from .io.lock import locked
 from .listing import presets_of_methods
-from .machine import check_device
+from .machine import check_device, processor_count
 from .named_protocol import check_capture, needed
 from .progress import counted, log_to_file
 from .progress import progress as show_progress
@@ -47,7 +49,8 @@ from .specs import CommandResult
 if TYPE_CHECKING:
     from .rows import Rows
 
-Preset = Literal["smoke", "demo", "fast", "paper"]
+log = logging.getLogger(__name__)
+Preset = Literal["quick", "smoke", "demo", "fast", "paper"]
 
 
 Assignments = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")]
@@ -55,44 +58,69 @@ Assignments = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.ar
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """Needs no data, no accelerator and no network. Everything is written to OUT: the capture, the avatars, the renders, tables
-    (Markdown, CSV, LaTeX) and contact_sheet.png. If it is interrupted, the same command continues it.
+    """Renders images of a synthetic head from several cameras, trains an avatar with each method on a part of them, and compares
+    the avatars on the others: a camera and expressions that no method was trained on. Takes about 3 minutes on two cores.
+    Everything is written to OUT; report.html shows it in a browser. If it is interrupted, the same command continues it.
     """
 
     out: str = "demo-output"
     """Output folder."""
-    preset: Preset = "demo"
-    """Preset: smoke takes seconds and gives no meaningful quality; demo takes minutes."""
+    preset: Preset = QUICK
+    """Length of the training. quick: about 3 minutes in all; demo: about 16 minutes, with more and larger images, the
+    speed of the avatars, and compressed ones; smoke: about a minute, for a test of the installation, too short for good images; fast
+    and paper: hours, see `headbench list presets`."""
     seed: int = 0
     """Seed of the training."""
     set: Assignments = ()
-    """Change a setting of the run, as for `headbench run`; repeatable. `capture.size=96x136`, `capture.subject_seed=3` and
-    similar settings change the capture."""
+    """Change a setting of the run, as for `headbench run`; repeatable. `capture.size=96x136` (pixels), `capture.subject_seed=3`
+    (another head), `capture.cameras=12` and `capture.timesteps=40` change the capture, `methods=ga,ours` the methods."""
+
+
+DURATIONS = {"smoke": "about a minute", QUICK: "about 3 minutes", "demo": "about 16 minutes"}
+"""How long the demo takes on two cores, by preset."""
+ONE_SUBJECT = (
+    "One subject ranks nobody: the order of the methods changes with the subject, the seed and the length of the training. "
+    "`headbench run suite` compares them on ten."
+)
 
 
 def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
-    """Run a complete comparison on a synthetic capture: render it, train, measure, print the table."""
+    """Run a complete comparison on a synthetic capture: render it, train, measure, print the table.
+
+    With the preset "quick", avatars are trained beside each other, with one thread each: a training keeps about 1.2 of 2 cores busy.
+    """
     values = parse_assignments(settings.set)
     capture = {"preset": settings.preset, "seed": settings.seed, "out": settings.out}
     given = merge({"capture": capture}, {"capture": values.pop("capture", {})})
     config = build(DemoConfig, given["capture"], "--set", "capture.")
     device = str(values.get("device", RunConfig.device))
     comparison = build_run_config(merge(demo_run_config(config, device), values), "--set")
-    if "conditions" not in values:
+    is_quick = comparison.preset == QUICK
+    if "conditions" not in values and not is_quick:
         comparison = replace(comparison, conditions=(PLAIN, *coded_conditions(comparison.methods)))
     # Report errors before making the capture, which takes minutes.
-    resolve_methods(comparison)
+    methods = resolve_methods(comparison)
     resolve_metrics(comparison)
     check_device(comparison.device)
     out = Path(settings.out)
     check_kind(out, "a run")
     check_output_folder(out)
+    beside = is_quick and comparison.device == "cpu" and processor_count() > 1
     with _log_file(out):
+        log.info(
+            "Rendering images of a synthetic head, training %s on a part of them, and comparing their renders with the others: %s on "
+            "two cores. Everything is written to %s.",
+            counted(sum(not method.spec.trivial for method in methods), "method"),
+            DURATIONS.get(comparison.preset, "hours"),
+            out,
+        )
         start = time.perf_counter()
-        with locked(out), show_progress("capture") as report:
+        with locked(out), show_progress("images of the capture") as report:
             make = resolve(get("datasets", "synthetic").implementation)
             make(**config.capture_arguments(), progress=report)
-        return _run(comparison, capture_seconds=round(time.perf_counter() - start, 3))
+        execution = Execution("processes") if beside else None
+        result = _run(comparison, execution, capture_seconds=round(time.perf_counter() - start, 3))
+    return result._replace(text=f"{result.text}\n{ONE_SUBJECT}")
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import logging
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Protocol
@@ -75,10 +75,18 @@ class _LogFile(logging.StreamHandler):
 
 
 class CellProgress(Protocol):
-    """A `Progress` that also receives the activity of each running cell by name, shown on terminals only."""
+    """A `Progress` that also receives the activity of each running cell by name, shown on terminals only, and the seconds left.
+
+    Without ``left``, the remaining time is estimated from the steps.
+    """
 
     def __call__(
-        self, done: int, total: int, note: str = "", cells: Callable[[], Mapping[str, str]] = dict
+        self,
+        done: int,
+        total: int,
+        note: str = "",
+        cells: Callable[[], Mapping[str, str]] = dict,
+        left: float | None = None,
     ) -> None: ...
 
 
@@ -86,13 +94,17 @@ class CellProgress(Protocol):
 def progress(label: str) -> Iterator[CellProgress]:
     """Yield a `Progress` callback that shows ``label``, the completed share and the remaining time."""
     with _line() as show:
-        left = TimeLeft()
+        by_steps = TimeLeft()
 
         def report(
-            done: int, total: int, note: str = "", cells: Callable[[], Mapping[str, str]] = dict
+            done: int,
+            total: int,
+            note: str = "",
+            cells: Callable[[], Mapping[str, str]] = dict,
+            left: float | None = None,
         ) -> None:
-            left.step(done, total)
-            text = _text(f"{label}: {done} of {total}", left.seconds, note)
+            by_steps.step(done, total)
+            text = _text(f"{label}: {done} of {total}", by_steps.seconds if left is None else left, note)
             running = cells() if live.is_interactive() else {}
             show(lambda: Position(text, text, done / total if total else 1.0, running))
 
@@ -112,8 +124,8 @@ class TimeLeft:
         self._left = total - done
         if self._samples and done < self._samples[-1][1]:
             self._samples.clear()
-        if not self._samples or now - self._samples[-1][0] >= SAMPLE_EVERY_S:
-            self._samples.append((now, done))
+        if done and (not self._samples or now - self._samples[-1][0] >= SAMPLE_EVERY_S):
+            self._samples.append((now, done))  # the time before the first step is that of starting
 
     @property
     def seconds(self) -> float | None:
@@ -124,6 +136,37 @@ class TimeLeft:
         if end - start < BASIS_S or done == base:
             return None
         return self._left * (end - start) / (done - base)
+
+
+class TasksLeft:
+    """Estimates the remaining time of tasks that run beside each other, from those that ended and the relative costs of all."""
+
+    def __init__(self, costs: Mapping[str, float]) -> None:
+        self._costs = dict(costs)
+        self._since: dict[str, float] = {}
+        self._ended_s = self._ended_cost = 0.0
+
+    def running(self, names: Iterable[str]) -> None:
+        """Set the tasks that run now."""
+        now = time.monotonic()
+        self._since = {name: self._since.get(name, now) for name in names}
+
+    def end(self, name: str) -> None:
+        """Record the end of a task."""
+        now = time.monotonic()
+        self._ended_s += now - self._since.pop(name, now)
+        self._ended_cost += self._costs.pop(name)
+
+    @property
+    def seconds(self) -> float | None:
+        """Seconds left; None before tasks of a cost of 1 have ended: in short ones, starting takes most of the time."""
+        if self._ended_cost < 1.0:
+            return None
+        now, rate = time.monotonic(), self._ended_s / self._ended_cost
+        each = [
+            max(0.0, rate * cost - now + self._since.get(name, now)) for name, cost in self._costs.items()
+        ]
+        return max([sum(each) / max(len(self._since), 1), *each], default=0.0)
 
 
 @contextmanager
@@ -192,9 +235,9 @@ class RunProgress:
         known = [part for part in parts if part is not None]
         bound = "" if len(known) == len(parts) else "more than "
         count = "" if at is None else f" {at[0]} of {at[1]}"
-        place = f"cell {index + 1} of {len(self._names)}"
+        place = f"avatar {index + 1} of {len(self._names)}"
         total = sum(known) if known else None
-        text = _text(f"{place}, {cell}: {step}{count}", total, note, bound)
+        text = _text(f"{place} ({cell}): {step}{count}", total, note, bound)
         # All steps of a cell have the same weight, which is sufficient for a bar.
         share = at[0] / at[1] if at is not None and at[1] else 0.0
         before = steps.index(step) if step in steps else 0

@@ -88,7 +88,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        return f"{self.clip.subject} {self.label} seed {self.seed}"
+        return f"{self.label}, subject {self.clip.subject}, seed {self.seed}"
 
     @property
     def run(self) -> Path:

@@ -30,7 +30,7 @@ from ..io.lock import locked
 from ..machine import check_device_answers, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
 from ..progress import duration, run_progress
-from ..protocol import Protocol, make_protocols, missing_tasks
+from ..protocol import TASK_TITLES, Protocol, make_protocols, missing_tasks
 from ..registry import discover, get, resolve
 from ..rows import DISCARD, Rows
 from ..specs import ConditionSpec, DatasetSpec, MetricSpec
@@ -118,6 +118,7 @@ def run_locked(
     check_executor(execution, config.device)
     rows = _run(config, cells, metrics, folder, execution, clips, each or run_cell, unchecked, record)
     if reports:
+        log.info("writing tables, pictures and the report")
         write_reports(folder.root)  # after the captures were freed
     log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
     return rows
@@ -153,7 +154,7 @@ def _run(
     for reason in {} if config.drive else missing_tasks(config.tasks, protocols).values():
         log.warning("%s", reason)
     for protocol in protocols.values():
-        log.info("%s, protocol %s: %d frames", protocol.task, protocol.hash, len(protocol.keys))
+        log.info("%s: %d frames to score", TASK_TITLES[protocol.task], len(protocol.keys))
     if execution.executor == "inline":
         rows = run_jobs(jobs, metrics, each)
     else:

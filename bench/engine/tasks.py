@@ -39,6 +39,8 @@ from .training import log_kept
 log = logging.getLogger(__name__)
 REPORT_EVERY_S, LOG_EVERY_S = 2.0, 10.0
 """Seconds between progress records of a cell, shown in a terminal, and between lines of its log."""
+UNTRAINED_COST = 0.15
+"""Expected time of a cell without training (baselines, derived avatars), relative to one with training."""
 
 
 def execute(
@@ -69,14 +71,18 @@ def execute(
         ]
 
     failures = _failed_before(folder)
-    schedule = Schedule("cells", lambda task: stored_rows(places[task.place], steady) is not None, execution)
+    schedule = Schedule(
+        "avatars trained and measured",
+        lambda task: stored_rows(places[task.place], steady) is not None,
+        execution,
+    )
     for follows in (False, True):  # derived avatars wait for the training of their source
         failures |= schedule.run_all(left(steady, (follows,)))
     if len(steady) < len(metrics):
         write_json(folder.speed_pass, {"failed": failures})
         whole = replace(
             schedule,
-            label="speed of cells",
+            label="speed of avatars measured",
             is_done=lambda task: stored_rows(places[task.place], metrics) is not None,
             speed=True,
         )
@@ -123,7 +129,9 @@ def cell_task(job: Job, capture: int, folder: RunFolder) -> Task:
     """The task of a cell of the run in ``folder``; ``capture`` is the index of its subject among the captures found."""
     place = job.cell.folder.relative_to(folder.root).as_posix()
     cell = {"subject": job.clip.subject, "label": job.label, "seed": job.seed, "capture": capture}
-    return replace(Task.of(folder.root, place, f"{__name__}:execute_cell", **cell), device=job.device)
+    task = Task.of(folder.root, place, f"{__name__}:execute_cell", **cell)
+    trains = job.source is None and not job.method.spec.trivial
+    return replace(task, device=job.device, name=job.name, cost=1.0 if trains else UNTRAINED_COST)
 
 
 def execute_cell(task: Task, report: Callable[[str], None]) -> None:

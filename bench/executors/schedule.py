@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from ..machine import processor_count
-from ..progress import progress
+from ..progress import TasksLeft, progress
 from .outcome import TaskOutcome, read_outcome, write_outcome
 from .processes import Processes
 from .results import Executor, TaskResult
@@ -61,7 +61,7 @@ class Schedule:
         executor = self._executor(Path(tasks[0].root), len(tasks), tasks[0].device)
         with closing(executor), progress(self.label) as report:
             executor.submit(tasks)
-            done = 0
+            done, left = 0, TasksLeft({task.place: task.cost for task in tasks})
             while done < len(tasks):
                 for ended in executor.poll(self.execution.poll_s):
                     again = self._again(ended, failures)
@@ -69,9 +69,11 @@ class Schedule:
                         executor.submit([again])
                     else:
                         done += 1
+                        left.end(ended.task.place)
                 running = executor.running
+                left.running([task.place for task in running])
                 note = f"{len(running)} running" + (f", {len(failures)} failed" if failures else "")
-                report(done, len(tasks), note, partial(_activities, running))
+                report(done, len(tasks), note, partial(_activities, running), left.seconds)
         return failures
 
     def _executor(self, root: Path, tasks: int, device: str) -> Executor:
@@ -111,5 +113,5 @@ def _activities(tasks: Sequence[Task]) -> dict[str, str]:
     found = {}
     for task in tasks:
         outcome = read_outcome(task.folder)
-        found[task.place] = "starting" if outcome is None else outcome.get("doing", "starting")
+        found[task.name or task.place] = "starting" if outcome is None else outcome.get("doing", "starting")
     return found

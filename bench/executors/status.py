@@ -55,7 +55,7 @@ class CellState:
     @property
     def name(self) -> str:
         """Name in logs."""
-        return f"{self.subject} {self.method} seed {self.seed}"
+        return f"{self.method}, subject {self.subject}, seed {self.seed}"
 
 
 def run_status(run: Path) -> CommandResult:

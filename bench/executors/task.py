@@ -34,6 +34,10 @@ class Task:
         Number of restarts after a lost process or job.
     device : str
         Compute device, for the record of the machine.
+    name : str
+        Name in progress messages; "" for ``place``.
+    cost : float
+        Expected time, relative to the other tasks of its schedule.
     """
 
     root: str
@@ -45,6 +49,8 @@ class Task:
     speed: bool = False
     restarts: int = 0
     device: str = "cpu"
+    name: str = ""
+    cost: float = 1.0
 
     @classmethod
     def of(cls, root: Path, place: str, function: str, **arguments: Any) -> Task:

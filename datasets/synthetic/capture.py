@@ -175,7 +175,7 @@ def synthesize(
         _take_over(Path(pictures), out, plans)
     total = len(plans) * timesteps * cameras
     done = 0
-    progress(done, total, "planned")
+    progress(done, total)
     if execution is not None and execution.executor != "inline":
         _run_all(out, plans, execution)
     for plan in plans:
@@ -183,7 +183,7 @@ def synthesize(
         done += timesteps * cameras - sum(len(names) for _, _, names in work)
         for sequence, count in _render_missing(out, plan, work, workers):
             done += count
-            progress(done, total, f"{plan.person.name} {sequence}")
+            progress(done, total, f"subject {plan.person.name}, sequence {sequence}")
     return [plan.writer.write_metadata() for plan in plans]
 
 

@@ -24,6 +24,7 @@ SHORT: dict[str, Any] = {
 
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {"budget": {"iterations": 60}, **SHORT, "samples": 3_000},
+    "quick": {"budget": {"iterations": 480}, **SHORT, "samples": 10_000},
     "demo": {"budget": {"iterations": 1_000}, **SHORT, "samples": 20_000},
     "fast": {"budget": {"iterations": 1_450}, **SHORT, "samples": 40_000},
     "gpu": {"budget": {"iterations": 30_000}},

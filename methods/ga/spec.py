@@ -20,7 +20,7 @@ GA = MethodSpec(
     config="headbench.methods.ga.config:GAConfig",
     needs="headbench.methods.shared.needs:splats",
     variants="headbench.methods.avatars.derived.ga_variants:variants",
-    presets=splat_presets(SHORT, {}, fast=4_000),
+    presets=splat_presets(SHORT, {}, quick=800, fast=4_000),
     source="GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians, CVPR 2024, arXiv 2312.02069",
     bibtex=r"""@inproceedings{qian2024gaussianavatars,
   title     = {{GaussianAvatars}: Photorealistic Head Avatars with Rigged {3D} {Gaussians}},

@@ -36,6 +36,7 @@ def _preset(iterations: int, samples: int, teeth: int, max_splats: int | None, *
 
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": _preset(60, 3_000, 300, None),
+    "quick": _preset(900, 6_000, 300, 10_000),
     "demo": _preset(2_000, 12_000, 600, 20_000),
     "fast": _preset(2_650, 30_000, 1_500, 40_000, difference_sh_degree=1),
     "gpu": {"budget": {"iterations": 30_000}},

@@ -57,6 +57,14 @@ SHORT_PRESETS: dict[str, dict[str, Any]] = {
         "start_steps": 200,
         "motion_steps": 200,
     },
+    "quick": {
+        "budget": {"iterations": 200},
+        **SHORT,
+        "start_steps": 200,
+        "motion_steps": 400,
+        "max_points": 3_500,
+        "mouth_points": 300,
+    },
     "demo": {"budget": {"iterations": 1_500}, **SHORT},
     "fast": {"budget": {"iterations": 600}, **SHORT, "max_points": 20_000, "sr_widths": (32, 16)},
 }

@@ -47,6 +47,15 @@ INSTA = MethodSpec(
     needs="headbench.methods.shared.needs:insta",
     presets={
         "smoke": {"budget": {"iterations": 40}, **SHORT},
+        "quick": {
+            "budget": {"iterations": 300},
+            **SHORT,
+            "samples_per_iteration": 2**13,
+            "images_per_iteration": 2,
+            "round_samples": 24,
+            "occupancy_every": 16,
+            "learning_rate": 2e-2,
+        },
         "demo": {"budget": {"iterations": 400}, **SHORT},
         "fast": {
             "budget": {"iterations": 1_050},

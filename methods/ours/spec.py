@@ -60,7 +60,7 @@ OURS = MethodSpec(
     needs="headbench.methods.shared.needs:splats",
     variants="headbench.methods.avatars.derived.ours_variants:variants",
     ablations=ABLATIONS,
-    presets=splat_presets(SHORT, PAPER, fast=2_050),
+    presets=splat_presets(SHORT, PAPER, quick=390, fast=2_050),
     source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
     "CVPR 2025, arXiv 2504.14967",
     bibtex=r"""@inproceedings{wang2025compact,
@@ -79,6 +79,6 @@ OURS_PLUS = replace(
     ablations={},
     summary="The method ours with headbench's additions: weak penalty, colours of splats, smoothed directions, planned sizes.",
     implementation="headbench.methods.ours.method:OursPlus",
-    presets=splat_presets(_with_additions(SHORT), _with_additions(PAPER), fast=2_300),
+    presets=splat_presets(_with_additions(SHORT), _with_additions(PAPER), quick=400, fast=2_300),
     source=f"Additions by headbench to {OURS.source}",
 )

@@ -42,6 +42,7 @@ SHORT: dict[str, Any] = {
 
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {"budget": {"iterations": 60}, **SHORT, "samples": 3_000},
+    "quick": {"budget": {"iterations": 400}, **SHORT, "samples": 10_000},
     "demo": {"budget": {"iterations": 700}, **SHORT, "samples": 20_000},
     "fast": {"budget": {"iterations": 1_250}, **SHORT, "samples": 40_000},
     "nersemble": {"budget": {"iterations": 30_000}, **NERSEMBLE},

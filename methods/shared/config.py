@@ -240,7 +240,9 @@ SHORT_SPLATS: Mapping[str, Any] = {
 and rotation (`docs/explanation/methods/ga.md`)."""
 
 
-def splat_presets(short: Mapping[str, Any], paper: Mapping[str, Any], fast: int) -> dict[str, dict[str, Any]]:
+def splat_presets(
+    short: Mapping[str, Any], paper: Mapping[str, Any], quick: int, fast: int
+) -> dict[str, dict[str, Any]]:
     """Presets of a mesh-bound method from its own settings for short and published runs, with budgets and splat settings.
 
     ``fast`` is the number of iterations of that preset, in which all native methods take about the same processor time
@@ -248,6 +250,7 @@ def splat_presets(short: Mapping[str, Any], paper: Mapping[str, Any], fast: int)
     """
     return {
         "smoke": {"budget": {"iterations": 60}, **short, "splats": SHORT_SPLATS},
+        "quick": {"budget": {"iterations": quick}, **short, "splats": {**SHORT_SPLATS, "max_splats": 10_000}},
         "demo": {"budget": {"iterations": 2_000}, **short, "splats": {**SHORT_SPLATS, "max_splats": 20_000}},
         "fast": {"budget": {"iterations": fast}, **short, "splats": {**SHORT_SPLATS, "max_splats": 40_000}},
         **{

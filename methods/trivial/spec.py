@@ -20,7 +20,7 @@ class NearestCameraConfig:
     max_timesteps: int | None = None
 
 
-PRESETS = {name: {"budget": {"iterations": 1}} for name in ("smoke", "demo", "fast", "gpu", "paper")}
+PRESETS = {name: {"budget": {"iterations": 1}} for name in ("smoke", "quick", "demo", "fast", "gpu", "paper")}
 
 MEAN_IMAGE = MethodSpec(
     name="mean-image",

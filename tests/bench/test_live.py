@@ -87,14 +87,14 @@ def screen(text):
 def test_a_terminal_has_one_display_that_goes(end, code, left):
     text, ended = on_terminal(end)
     assert ended == code
-    assert "cell 1 of 2" in text
+    assert "avatar 1 of 2" in text
     assert "s1 ga: training 8 of 8" in text
     assert "cells: 1 of 3 (2 running)\r\n  s3/ga: training 5 of 9 (loss 1.0)\r\n  loss █▁" in text
     assert "\x1b[?25" not in text  # the cursor is never hidden, so none has to be shown again
     shown = screen(text)
     assert shown[0] == "a message"
     assert left in (None, shown)
-    assert not [line for line in shown if "cell 1 of 2" in line or "loss" in line.split()[:1]]
+    assert not [line for line in shown if "avatar 1 of 2" in line or "loss" in line.split()[:1]]
 
 
 def test_a_pipe_gets_no_control_characters():

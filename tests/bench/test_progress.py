@@ -7,7 +7,7 @@ import pytest
 
 from headbench.bench import progress as module
 from headbench.bench.engine import run as runner
-from headbench.bench.progress import RunProgress, TimeLeft, duration
+from headbench.bench.progress import RunProgress, TasksLeft, TimeLeft, duration
 
 
 class Clock:
@@ -71,6 +71,25 @@ def test_time_left_follows_from_steps_alone(clock, waits, steps, left):
     assert found.seconds == (None if left is None else pytest.approx(left))
 
 
+def test_time_left_of_tasks_follows_from_those_that_ended(clock):
+    left = TasksLeft({"baseline": 0.5, "a": 1.0, "b": 1.0, "c": 1.0, "d": 0.5})
+    left.running(["baseline", "a"])
+    clock.passes(5.0)
+    left.end("baseline")
+    left.running(["a", "b"])
+    assert left.seconds is None  # baselines say little
+    clock.passes(5.0)
+    left.end("a")  # so that a whole task takes 10 seconds
+    left.running(["b", "c"])
+    assert left.seconds == pytest.approx((5 + 10 + 5) / 2)
+    clock.passes(5.0)
+    left.end("b")
+    left.running(["c"])
+    assert left.seconds == pytest.approx(5 + 5)
+    clock.passes(100.0)
+    assert left.seconds == 5.0
+
+
 def cells(*names, stages=("training", "rendering")):
     return {f"{subject} {method}": dict.fromkeys(stages, method) for subject, method in names}
 
@@ -83,16 +102,16 @@ def test_a_run_has_a_bound_until_all_of_it_has_a_basis(clock, lines):
             with run.step(cell, stage) as report:
                 work(clock, report, 10, seconds[stage][cell[3:]])
     assert [line for line in lines if re.search("ing 5 of", line)] == [
-        "cell 1 of 4, s1 ga: training 5 of 10, more than 50 s left",
-        "cell 1 of 4, s1 ga: rendering 5 of 10, more than 1 min 40 s left",
-        "cell 2 of 4, s1 ours: training 5 of 10, more than 3 min 30 s left",
-        "cell 2 of 4, s1 ours: rendering 5 of 10, more than 5 min 20 s left",
-        "cell 3 of 4, s2 ga: training 5 of 10, 4 min 40 s left",
-        "cell 3 of 4, s2 ga: rendering 5 of 10, 3 min 45 s left",
-        "cell 4 of 4, s2 ours: training 5 of 10, 2 min 00 s left",
-        "cell 4 of 4, s2 ours: rendering 5 of 10, 10 s left",
+        "avatar 1 of 4 (s1 ga): training 5 of 10, more than 50 s left",
+        "avatar 1 of 4 (s1 ga): rendering 5 of 10, more than 1 min 40 s left",
+        "avatar 2 of 4 (s1 ours): training 5 of 10, more than 3 min 30 s left",
+        "avatar 2 of 4 (s1 ours): rendering 5 of 10, more than 5 min 20 s left",
+        "avatar 3 of 4 (s2 ga): training 5 of 10, 4 min 40 s left",
+        "avatar 3 of 4 (s2 ga): rendering 5 of 10, 3 min 45 s left",
+        "avatar 4 of 4 (s2 ours): training 5 of 10, 2 min 00 s left",
+        "avatar 4 of 4 (s2 ours): rendering 5 of 10, 10 s left",
     ]
-    assert lines[0] == "cell 1 of 4, s1 ga: training"
+    assert lines[0] == "avatar 1 of 4 (s1 ga): training"
 
 
 @pytest.mark.parametrize("subjects", [("subject1", "subject2")])
@@ -100,10 +119,12 @@ def test_a_run_names_its_cells_in_order(config, lines):
     runner.run(config)
     steps = ("training 2 of 2", "rendering 5 of 5", "measuring novel_view 3 of 3", "measuring the avatar")
     for step in steps:
-        assert any(line.startswith(f"cell 2 of 2, subject2 toy seed 0: {step}") for line in lines), step
+        assert any(
+            line.startswith(f"avatar 2 of 2 (toy, subject subject2, seed 0): {step}") for line in lines
+        ), step
     lines.clear()
     runner.run(config)
-    assert not [line for line in lines if line.startswith("cell")]
+    assert not [line for line in lines if line.startswith("avatar")]
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ SPECS = {
     spec.name: spec
     for spec in (FLASHAVATAR, OURS, GA, GBS, GHA, INSTA, RGBAVATAR, MEAN_IMAGE, NEAREST_CAMERA)
 }
-PRESETS = ("smoke", "demo", "fast", "gpu", "paper")
+PRESETS = ("smoke", "quick", "demo", "fast", "gpu", "paper")
 
 
 @pytest.mark.parametrize("name", SPECS)
@@ -67,6 +67,18 @@ def test_insta_is_refused_on_a_gpu_before_any_work(tmp_path):
     assert resolve_methods(replace(config, device="cpu"))
     everywhere, on_gpus = (demo_run_config(DemoConfig(), device)["methods"] for device in ("cpu", "cuda"))
     assert set(everywhere) - set(on_gpus) == {"insta"}
+
+
+def test_the_quick_demo_has_all_methods_and_no_speed():
+    quick, long = DemoConfig(), DemoConfig(preset="demo")
+    short, full = (demo_run_config(config, "cpu") for config in (quick, long))
+    assert short["methods"] == full["methods"]
+    left_out = set(full["metrics"]) - set(short["metrics"])
+    assert "fps" in left_out
+    assert not left_out & {"psnr", "ssim", "lpips", "storage", "training_time"}
+    assert quick.capture_arguments()["timesteps"] < long.capture_arguments()["timesteps"]
+    given = replace(quick, cameras=3, size="48x64").capture_arguments()
+    assert (given["cameras"], given["size"]) == (3, (48, 64))
 
 
 @pytest.mark.parametrize("name", SPECS)
@@ -99,7 +111,7 @@ def test_paper_presets_are_the_published_values():
     assert values(published.lines, "start", "lr", "network_lr") == (60_000, 2e-3, 1e-4)
 
 
-@pytest.mark.parametrize("preset", ["smoke", "demo", "fast"])
+@pytest.mark.parametrize("preset", ["smoke", "quick", "demo", "fast"])
 def test_short_presets_share_rates_that_paper_leaves_alone(preset):
     ga, gbs, ours = (resolve_method(spec, preset, {}).config for spec in (GA, GBS, OURS))
     assert values(ga.splats, *RATES) == values(ours.splats, *RATES) == (0.2, 1e-3, 0.05, 0.05, 0.01)
@@ -125,7 +137,7 @@ def test_the_paper_preset_of_gha_is_the_published_design():
     rule = paper.spec.resolution
     assert (rule.square, rule.size, rule.speed_size) == ("pad", (2048, 2048), (1024, 1024))
     assert 2048 / paper.config.upscale == 512
-    for preset in ("smoke", "demo", "fast"):
+    for preset in ("smoke", "quick", "demo", "fast"):
         assert resolve_method(GHA, preset, {}).spec.resolution.native
 
 

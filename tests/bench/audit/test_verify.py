@@ -104,7 +104,7 @@ def other_rules(folder):
         (FRAME, lambda path: path.write_bytes(b"no image"), "is not as it was written"),
         ("subject1/toy/seed-0/digests.json", Path.unlink, "renders/novel_view/EMO_00000_b.png"),
         ("subject1/toy/seed-0/avatar/level.txt", lambda path: path.write_text("0.75"), "level.txt"),
-        ("run.json", another_level, "fit.json: expected the avatar of subject1 toy seed 0"),
+        ("run.json", another_level, "fit.json: expected the avatar of toy, subject subject1, seed 0"),
         ("protocols", other_rules, "other frames or rules"),
     ],
 )

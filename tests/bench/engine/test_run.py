@@ -554,7 +554,7 @@ def test_planned_cells_have_their_state_and_nothing_is_trained(config, toy, fini
     changes = {"preset": "fast", "settings": {"toy": {"budget": {"iterations": 3}}}}
     longer = replace(config, out=f"{config.out}-long", **changes)
     for settings, state in ((config, "done"), (longer, "to train")):
-        names = [f"{subject} toy seed 0" for subject in ("subject1", "subject2")]
+        names = [f"toy, subject {subject}, seed 0" for subject in ("subject1", "subject2")]
         assert runner.planned_cells(settings) == dict.fromkeys(names, state)
     assert toy.FITS == []
     assert not Path(longer.out).exists()

@@ -65,7 +65,7 @@ def test_rows_are_those_of_one_process_and_done_cells_are_kept(config, rows_of, 
     assert cli.main(["status", config.out]) == 1
     shown = capsys.readouterr().out
     assert "0 waiting, 0 running, 2 done, 1 failed" in shown
-    assert "failing seed 0: RuntimeError: the training diverged; see " in shown
+    assert "failing, subject subject1, seed 0: RuntimeError: the training diverged; see " in shown
     failing = cell_of(config, "subject1", "failing")
     outcome = read_outcome(failing)
     assert (outcome["status"], outcome["reason"]) == ("failed", "RuntimeError: the training diverged")
@@ -111,7 +111,7 @@ def test_kept_cells_are_named_and_changed_code_fails_others(config, rows_of, cap
         machine = {**own, "processor": processor}
         write_outcome(cell_of(config, subject, "toy"), {"status": "done", "speed": False, "machine": machine})
     runner.run(config, TWO)
-    assert caplog.text.count("toy seed 0: kept: trained ") == 2
+    assert caplog.text.count("seed 0: kept: trained ") == 2
     assert folder.read_manifest().machine == {**own, "processor": "A and B"}
     assert "not comparable" in caplog.text
     assert _Run.read(folder.root).cells.keys() == {"toy"}

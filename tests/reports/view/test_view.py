@@ -140,7 +140,9 @@ def test_what_is_not_trained_is_named(run, tmp_path):
     shutil.copytree(run.root.parent / "data", tmp_path / "data")
     (tmp_path / "out" / "901" / "gbs" / "seed-0" / "fit.json").unlink()
     (tmp_path / "out" / "901" / "ga" / "seed-0" / "avatar" / "head_model.npz").write_bytes(b"")
-    with pytest.raises(InputError, match="ga seed 0: .*head_model.npz.*gbs seed 0: not trained"):
+    with pytest.raises(
+        InputError, match="ga, subject 901, seed 0: .*head_model.npz.*gbs, subject 901, seed 0: not trained"
+    ):
         open_scene(ViewSettings((str(tmp_path / "out"),)), tmp_path / "kept")
     shutil.copyfile(
         run.cell("901", "ga", 0).avatar / "head_model.npz",
@@ -148,7 +150,7 @@ def test_what_is_not_trained_is_named(run, tmp_path):
     )
     scene = open_scene(ViewSettings((str(tmp_path / "out"),)), tmp_path / "kept")
     assert [shown.label for shown in scene.shown] == ["ga"]
-    assert scene.missing == ["901 gbs seed 0: not trained"]
+    assert scene.missing == ["gbs, subject 901, seed 0: not trained"]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,37 @@
+"""The demo: what it says before it starts and after it has ended, and how its avatars are trained."""
+
+import pytest
+
+from headbench.bench import comparison
+from headbench.bench.contracts import no_progress
+from headbench.bench.specs import CommandResult
+
+
+@pytest.mark.parametrize(
+    ("preset", "cores", "executor", "takes"),
+    [
+        ("quick", 2, "processes", "about 3 minutes on two cores"),
+        ("quick", 1, None, "about 3 minutes on two cores"),
+        ("demo", 2, None, "about 16 minutes on two cores"),
+    ],
+)
+def test_the_demo_says_how_long_it_takes(monkeypatch, tmp_path, preset, cores, executor, takes):
+    started = []
+
+    def run(config, execution, **record):
+        started.append((config, execution))
+        return CommandResult("the table", {})
+
+    monkeypatch.setattr(comparison, "processor_count", lambda: cores)
+    monkeypatch.setattr(comparison, "resolve", lambda name: lambda **settings: None)
+    monkeypatch.setattr(comparison, "_run", run)
+    out = str(tmp_path / "out")
+    result = comparison.demo(comparison.DemoSettings(out, preset), no_progress)
+    ((config, execution),) = started
+    assert (execution and execution.executor) == executor
+    assert bool(config.conditions[1:]) == (preset == "demo")  # coded avatars
+    first = (tmp_path / "out" / "run.log").read_text().splitlines()[0]
+    assert "training 6 methods" in first
+    assert takes in first
+    assert first.endswith(f"{out}.")
+    assert result.text.startswith("the table\nOne subject ranks nobody")
