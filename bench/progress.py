@@ -75,36 +75,25 @@ class _LogFile(logging.StreamHandler):
 
 
 class CellProgress(Protocol):
-    """A `Progress` that also receives the activity of each running cell by name, shown on terminals only, and the seconds left.
-
-    Without ``left``, the remaining time is estimated from the steps.
-    """
+    """A `Progress` that also receives the activity of each running cell by name, shown on terminals only."""
 
     def __call__(
-        self,
-        done: int,
-        total: int,
-        note: str = "",
-        cells: Callable[[], Mapping[str, str]] = dict,
-        left: float | None = None,
+        self, done: int, total: int, note: str = "", cells: Callable[[], Mapping[str, str]] = dict
     ) -> None: ...
 
 
 @contextmanager
-def progress(label: str) -> Iterator[CellProgress]:
-    """Yield a `Progress` callback that shows ``label``, the completed share and the remaining time."""
+def progress(label: str, tasks: TasksLeft | None = None) -> Iterator[CellProgress]:
+    """Yield a `Progress` callback that shows ``label``, the completed share and the remaining time, by steps or of ``tasks``."""
     with _line() as show:
-        by_steps = TimeLeft()
+        left = tasks or TimeLeft()
 
         def report(
-            done: int,
-            total: int,
-            note: str = "",
-            cells: Callable[[], Mapping[str, str]] = dict,
-            left: float | None = None,
+            done: int, total: int, note: str = "", cells: Callable[[], Mapping[str, str]] = dict
         ) -> None:
-            by_steps.step(done, total)
-            text = _text(f"{label}: {done} of {total}", by_steps.seconds if left is None else left, note)
+            if isinstance(left, TimeLeft):
+                left.step(done, total)
+            text = _text(f"{label}: {done} of {total}", left.seconds, note)
             running = cells() if live.is_interactive() else {}
             show(lambda: Position(text, text, done / total if total else 1.0, running))
 

@@ -59,9 +59,10 @@ class Schedule:
         if not tasks:
             return failures
         executor = self._executor(Path(tasks[0].root), len(tasks), tasks[0].device)
-        with closing(executor), progress(self.label) as report:
+        left = TasksLeft({task.place: task.cost for task in tasks})
+        with closing(executor), progress(self.label, left) as report:
             executor.submit(tasks)
-            done, left = 0, TasksLeft({task.place: task.cost for task in tasks})
+            done = 0
             while done < len(tasks):
                 for ended in executor.poll(self.execution.poll_s):
                     again = self._again(ended, failures)
@@ -73,7 +74,7 @@ class Schedule:
                 running = executor.running
                 left.running([task.place for task in running])
                 note = f"{len(running)} running" + (f", {len(failures)} failed" if failures else "")
-                report(done, len(tasks), note, partial(_activities, running), left.seconds)
+                report(done, len(tasks), note, partial(_activities, running))
         return failures
 
     def _executor(self, root: Path, tasks: int, device: str) -> Executor:
