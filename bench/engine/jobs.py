@@ -218,6 +218,7 @@ def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -
 
 
 def load(job: Job) -> Avatar:
-    """Read the avatar of a cell or of its source."""
-    avatar: Avatar = job.create().load((job.source or job.cell).avatar, device=job.device)
+    """Read the avatar of a cell: its own, also one derived from another, or that of its source."""
+    cell = job.cell if job.source is None or job.condition.derive else job.source
+    avatar: Avatar = job.create().load(cell.avatar, device=job.device)
     return avatar

@@ -8,6 +8,8 @@ import pandas as pd
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.audit import verify as script
+from headbench.bench.condition import PLAIN, Condition, Named
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.captures import run_configuration
 from headbench.bench.engine.config import RunOptions
@@ -141,3 +143,10 @@ def test_what_is_no_finished_run_gives_no_verdict(run, tmp_path):
     replace(RunFolder(run).read_manifest(), status="started").write(RunFolder(run).manifest)
     for folder in (run, tmp_path):
         assert cli.main(["verify", str(folder), "--trust"]) == 3
+
+
+def test_a_derived_avatar_is_rendered_itself(config, toy, monkeypatch):
+    dark = Condition("dark", ("varying",), derive=Named("variant", {"name": "dark"}))
+    monkeypatch.setattr(script, "CODED_VARIANT", dark.derive)
+    runner.run(replace(config, methods=("toy_plugin:VARYING",), conditions=(PLAIN, dark)))
+    assert cli.main(["verify", config.out, "--trust", "--render"]) == 0
