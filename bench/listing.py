@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -60,7 +61,7 @@ def list_installed(settings: ListSettings, progress: Progress) -> CommandResult:
         entries = [
             {
                 "name": f"{entry['name']} {preset}",
-                "summary": ", ".join(f"{key}={value}" for key, value in values.items()),
+                "summary": ", ".join(_assigned(values)),
                 "settings": values,
                 "error": "",
             }
@@ -68,6 +69,15 @@ def list_installed(settings: ListSettings, progress: Progress) -> CommandResult:
             for preset, values in entry.get("presets", {}).items()
         ]
     return _shown(entries)
+
+
+def _assigned(values: Mapping[str, Any], group: str = "") -> Iterator[str]:
+    """Settings as ``--set`` takes them."""
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _assigned(value, f"{group}{key}.")
+        else:
+            yield f"{group}{key}={value}"
 
 
 def _shown(entries: list[dict[str, Any]]) -> CommandResult:
