@@ -36,6 +36,7 @@ def test_a_benchmark_has_every_row(measure, monkeypatch):
     assert torch.get_num_threads() == threads
 
 
+@pytest.mark.commands
 def test_every_listed_benchmark_is_tried():
     specs = [plugin.spec for plugin in discover("benchmarks").values()]
     named = {name for spec in specs for name in (spec.speed, spec.tradeoffs, spec.stress) if name}

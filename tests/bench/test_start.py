@@ -119,6 +119,7 @@ def run_words(tmp_path):
     ]
 
 
+@pytest.mark.commands
 def test_a_signal_in_training_is_a_line_and_the_run_goes_on(start, run_words, tmp_path):
     process = start(*run_words)
     assert process.stdout.readline() == "training\n"

@@ -4,6 +4,8 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from headbench.bench.engine import run as runner
 
 
@@ -32,6 +34,7 @@ def content(out):
     return sorted(str(path.relative_to(out)) for path in Path(out).rglob("*"))
 
 
+@pytest.mark.commands
 def test_a_run_killed_before_any_write_continues(config):
     whole = runner.run(config)
     for number in range(1, 100):

@@ -25,6 +25,8 @@ from headbench.bench.io.lock import is_locked
 
 from .cluster import wait_for
 
+pytestmark = pytest.mark.commands
+
 TWO = Execution("processes", workers=2, threads=1)
 OPTIONS = ("--executor", "processes", "--workers", "1", "--set", "execution.threads=1")
 

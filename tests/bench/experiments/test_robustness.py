@@ -37,6 +37,7 @@ def renders(balls, monkeypatch):
     return done
 
 
+@pytest.mark.commands
 def test_worker_processes_leave_the_same(ball_run):
     folder = ball_run("BURSTING", "LISTED")
     outs = [folder.parent / name for name in ("inline", "tasks")]

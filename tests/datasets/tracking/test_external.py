@@ -119,6 +119,7 @@ def calls(settings):
     return (Path(settings.checkout) / "calls.txt").read_text().splitlines()
 
 
+@pytest.mark.commands
 def test_a_kill_ends_the_program_and_finished_steps_stay(settings, tmp_path):
     given = settings("pixel3dmm", {"track.py video_name": "sleep"})
     command = [sys.executable, "-m", "headbench.bench.start", "track", given.capture, "--head", given.head]

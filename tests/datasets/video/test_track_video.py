@@ -33,6 +33,8 @@ from headbench.datasets.video.faces import Crop, FoundFaces, crop_around
 
 from ..tiny_capture import look_at, make_plan, posed_vertices
 
+pytestmark = pytest.mark.commands
+
 HEIGHT, WIDTH, COUNTED = 96, 72, 12
 FACELESS = 5
 

@@ -47,6 +47,7 @@ def parity(*words):
     return cli.main([*line.split(), *words])
 
 
+@pytest.mark.commands
 def test_both_are_trained_and_their_difference_tabled(folder, capsys):
     words = ("--iterations", "5", "--orders", "1", "--tolerance", "200")
     assert parity(*words) == 0
