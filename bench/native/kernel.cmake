@@ -23,11 +23,12 @@ function(headbench_kernel)
     target_link_libraries(${target} PRIVATE Threads::Threads)
   endif()
 
-  set(options_portable "")
-  set(options_neon "")
-  set(options_avx2 -mavx2 -mfma)
+  # -O3 makes networks half as fast again, at a third more time to compile; portable code runs only on processors without AVX2.
+  set(options_portable -fpeel-loops)
+  set(options_neon -O3)
+  set(options_avx2 -O3 -mavx2 -mfma)
   # GCC's own header warns of a register it leaves undefined on purpose (GCC bug 105593).
-  set(options_avx512 -mavx2 -mfma -mavx512f -mavx512dq -mavx512bw -mavx512vl -Wno-uninitialized
+  set(options_avx512 -O3 -mavx2 -mfma -mavx512f -mavx512dq -mavx512bw -mavx512vl -Wno-uninitialized
     -Wno-maybe-uninitialized)
   set(sets portable)
   if(CMAKE_SYSTEM_PROCESSOR MATCHES "^(x86_64|AMD64|amd64)$")
@@ -48,7 +49,7 @@ function(headbench_kernel)
     set(variant ${CMAKE_CURRENT_BINARY_DIR}/${target}_${set}.cpp)
     file(CONFIGURE OUTPUT ${variant} CONTENT "#include \"${folder}/variants.cpp\"\n")
     set_source_files_properties(${variant} PROPERTIES
-      COMPILE_DEFINITIONS "HEADBENCH_ISA=${set};HEADBENCH_ISA_${set}" COMPILE_OPTIONS "-fpeel-loops;${options_${set}}")
+      COMPILE_DEFINITIONS "HEADBENCH_ISA=${set};HEADBENCH_ISA_${set}" COMPILE_OPTIONS "${options_${set}}")
     target_sources(${target} PRIVATE ${variant})
   endforeach()
   install(TARGETS ${target} LIBRARY DESTINATION headbench/${KERNEL_FOLDER})
