@@ -89,7 +89,7 @@ class StoredResults:
         same = self.read(*folders, *(self.gallery / "suite" / "run" / run.name for run in folders))
         further, new = same.only(same.ranked).shared.by_camera, self.run(folders[0]).methods
         beside = f"{main_table(further)}\n\n{differences(further, new, REFERENCE)}"
-        columns = Columns(digits=("psnr=1", "ssim=3", "lpips=3", "fps=0"))
+        columns = Columns(digits=("psnr=1", "ssim=3", "lpips=3"))
         printed = to_text(table_of(demo, columns=replace(columns, names=(NOVEL, "psnr", "ssim", "lpips"))))
         lines = [f"{OURS}+{name}" for name in get("methods", OURS).ablations]
         return {
