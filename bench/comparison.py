@@ -68,7 +68,7 @@ class DemoSettings:
     preset: Preset = QUICK
     """Length of the training. quick: about 3 minutes in all; demo: about 16 minutes, with more and larger images, the
     speed of the avatars, and compressed ones; smoke: about a minute, for a test of the installation, too short for good images; fast
-    and paper: hours, see `headbench list presets`."""
+    and paper: longer, see `headbench list presets`."""
     seed: int = 0
     """Seed of the training."""
     set: Assignments = ()
@@ -111,7 +111,7 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
             "Rendering images of a synthetic head, training %s on a part of them, and comparing their renders with the others: %s on "
             "two cores. Everything is written to %s.",
             counted(sum(not method.spec.trivial for method in methods), "method"),
-            DURATIONS.get(comparison.preset, "hours"),
+            DURATIONS.get(comparison.preset, "more than 16 minutes"),
             out,
         )
         start = time.perf_counter()

@@ -93,9 +93,8 @@ def table(
         shown = []
         for text in printed.get().splitlines():
             shown.append(groups.pop(0) if _GROUP in text else text.rstrip())
-            if len(lines[0]) == 1 and not text.strip(
-                "- "
-            ):  # that of the first rows, below the line of dashes
+            # That of the first rows, below the line of dashes.
+            if lines and len(lines[0]) == 1 and not text.strip("- "):
                 shown.append(groups.pop(0))
         texts.append("\n".join(shown))
     return "\n\n".join(texts)

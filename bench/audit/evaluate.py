@@ -1,4 +1,4 @@
-"""Scores a folder of images as if a method of a run had rendered them."""
+"""Scores a folder of images as if a method of a run had rendered them, after a check of their background."""
 
 from __future__ import annotations
 

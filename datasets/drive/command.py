@@ -1,4 +1,4 @@
-"""``headbench drive``."""
+"""``headbench drive``: renders an avatar with a driving signal, as a video or a capture, and measures the result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Formats of driving signals: how each is recognised and read."""
+"""Formats of driving signals: how each is recognised and read, with mapped columns and coefficients of a head model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Landmarks by MediaPipe's face landmark network."""
+"""Landmarks by MediaPipe's face landmark network, and their places on a head, found in drawings of it."""
 
 from __future__ import annotations
 

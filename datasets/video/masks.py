@@ -1,4 +1,4 @@
-"""Sources of the masks of a video's frames."""
+"""Sources of the masks of a video's frames, MediaPipe's selfie segmentation among them."""
 
 from __future__ import annotations
 

@@ -205,7 +205,9 @@ def curve_table(curve: CurveData, place: int) -> str:
         values = [point.values for point in points]
         cells = [" / ".join(f"{own[f'psnr_{kind}']:.2f}" for kind in kinds) for own in values]
         lines.append([f"`{method}`", *cells, f"{max(own['storage'] for own in values):.1f}"])
-    head = f"PSNR in dB, held-out {' / '.join(kinds)}, means over subjects {', '.join(curve.subjects)}:"
+    head = (
+        f"PSNR in dB, held-out {' / '.join(kinds)}, means over subjects {', '.join(sorted(curve.subjects))}:"
+    )
     return f"{head}\n\n{pipe_table(lines)}\n\n{leaders_text(curve)}"
 
 

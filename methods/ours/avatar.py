@@ -1,4 +1,4 @@
-"""The trained avatar of "ours": its rendering."""
+"""The trained avatar of "ours": its rendering, with offsets of the feature lines prepared for fast frames."""
 
 from __future__ import annotations
 
@@ -160,15 +160,6 @@ class OursAvatar(StoredSplatAvatar):
         files, head, subject, field = read_stored(folder, FIELD_FILE, content_of, coded)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
         return cls(files, mesh, subject, field, device)
-
-    @torch.no_grad()
-    def static_logits(self) -> Tensor:
-        """(N,) logits of the opacities when all driving coefficients are 0."""
-        if self.line_offsets is None:
-            return self.neutral.logits
-        still = self.neutral.logits.new_zeros(self._expressions + len(self._jaw_bases))
-        offsets = self.line_offsets(still)
-        return apply_offsets(self.neutral, offsets, self.field.dynamic).logits
 
     def _posed(self, pose: HeadPose) -> DrivenPose:
         if self.line_offsets is None:

@@ -1,4 +1,4 @@
-"""The points of a curve, read from the run of all its trainings: a table, ``curve.csv`` and ``curve.png``."""
+"""A curve, read from the run of all its trainings: table, ``curve.csv``, ``curve.png``, and the best method at each cost."""
 
 from __future__ import annotations
 

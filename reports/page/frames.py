@@ -1,4 +1,4 @@
-"""Selects the frames of a page and encodes them: WebP in data URIs, with a maximum total size."""
+"""Selects the frames of a page, the first one shown among them, and encodes them: WebP in data URIs, with a maximum total size."""
 
 from __future__ import annotations
 

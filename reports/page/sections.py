@@ -1,4 +1,4 @@
-"""Cards of methods: description, authors, and results of the runs."""
+"""Sections of a page: provenance of a run, cards of its methods, curves of training losses."""
 
 from __future__ import annotations
 

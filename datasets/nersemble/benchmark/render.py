@@ -1,4 +1,4 @@
-"""Renders the test frames of the benchmark's monocular track from a stored avatar."""
+"""Reads the sequences of the benchmark's monocular track and renders their test frames from a stored avatar."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Derived variants of a trained avatar: each change alone, then several together."""
+"""Derived variants of a trained avatar: coded, each change alone, then several together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Export of an avatar as a web page, and the loss of quality."""
+"""Export of an avatar as a web page, with its sliders and recorded sequences, and the loss of quality."""
 
 from __future__ import annotations
 
