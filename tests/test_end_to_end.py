@@ -185,7 +185,7 @@ CASES = {
     "run suite": [
         case(
             SUITE,
-            "(?s)FREE-4-speech.*Images of twice the size",
+            "Tables of all results: suite/results.md",
             "suite/results.md",
             "suite/run/01/rows.parquet",
             "suite/run-large/01/rows.parquet",
@@ -227,12 +227,12 @@ CASES = {
     "evaluate": [
         case(
             f"evaluate {cell('ours')} --like {{demo}} --out theirs --label theirs",
-            r"\| theirs",
+            r"\ntheirs ",
             "theirs/run.json",
         ),
         case(
             f"evaluate --avatar {cell('ours')}/avatar --clip {{capture}} --out stored --frames-per-task 1",
-            r"(?s)Storage.*\| ours ",
+            r"(?s)Storage.*\nours ",
             "stored/rows.parquet",
         ),
         case("verify stored", "as recorded"),
