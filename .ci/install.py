@@ -143,6 +143,8 @@ def main(folder, build=""):
     if not build:
         build = "cpu" if to.finds("requirements-torch-cpu.txt") else "cuda"
         if build == "cuda":
+            if not to.finds("requirements-torch-cuda.txt"):
+                raise Failed(f"PyTorch cannot be found: {to.reason()}")
             print(
                 "No source that pip is configured for has PyTorch's CPU build: the one with CUDA is taken, several GB."
             )

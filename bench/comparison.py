@@ -90,6 +90,8 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
     With the preset "quick", avatars are trained beside each other, with one thread each: a training keeps about 1.2 of 2 cores busy.
     """
     values = parse_assignments(settings.set)
+    if "preset" in values:
+        raise InputError("command line", "--set preset", "--preset of the demo", str(values["preset"]))
     capture = {"preset": settings.preset, "seed": settings.seed, "out": settings.out}
     given = merge({"capture": capture}, {"capture": values.pop("capture", {})})
     config = build(DemoConfig, given["capture"], "--set", "capture.")

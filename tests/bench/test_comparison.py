@@ -4,6 +4,7 @@ import pytest
 
 from headbench.bench import comparison
 from headbench.bench.contracts import no_progress
+from headbench.bench.errors import InputError
 from headbench.bench.specs import CommandResult
 
 
@@ -35,3 +36,8 @@ def test_the_demo_says_how_long_it_takes(monkeypatch, tmp_path, preset, cores, e
     assert takes in first
     assert first.endswith(f"{out}.")
     assert result.text.startswith("the table\nOne subject ranks nobody")
+
+
+def test_the_preset_of_the_demo_is_no_setting(tmp_path):
+    with pytest.raises(InputError, match="--preset"):
+        comparison.demo(comparison.DemoSettings(str(tmp_path / "out"), set=("preset=demo",)), no_progress)

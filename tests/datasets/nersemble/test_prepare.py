@@ -11,6 +11,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.files import write_json
+from headbench.bench.io.lock import locked
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
 from headbench.datasets.head.subject import PosedSubject
@@ -339,3 +340,17 @@ def test_bad_options_are_named(change, key, pristine_recording, tmp_path):
         prepare_nersemble(pristine_recording.settings(tmp_path / "out", **change))
     assert error.value.key == key
     assert not (tmp_path / "out").exists()
+
+
+def test_a_subject_is_prepared_by_one_process_at_a_time(whole, pristine_recording, tmp_path):
+    union = tmp_path / whole[1].data[SUBJECT]["union"].name
+    with locked(union, beside=True), pytest.raises(InputError, match="no other process"):
+        prepared(pristine_recording, tmp_path)
+
+
+def test_images_are_never_enlarged(recording, tmp_path):
+    edit_json(recording.calibration_file, lambda value: value.update(height=2 * HEIGHT, width=2 * WIDTH))
+    with pytest.raises(InputError) as error:
+        prepared(recording, tmp_path / "out", downscale=1)
+    assert error.value.key == "downscale"
+    assert prepared(recording, tmp_path / "out", downscale=2)[0]["written"] == IMAGES

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from headbench.bench.configuration import deciding_settings
 from headbench.bench.errors import InputError
 from headbench.methods.official.checkout import Repository, inspect_checkout
 from headbench.methods.official.config import GAOfficialConfig
@@ -64,3 +65,9 @@ def test_a_folder_without_git_needs_an_empty_commit(repository, tmp_path):
     with pytest.raises(InputError, match="not a git checkout"):
         inspect_checkout("ga-official", settings(folder, repository[1]), REPOSITORY)
     assert inspect_checkout("ga-official", settings(folder, ""), REPOSITORY).record["commit"] == ""
+
+
+def test_where_the_checkout_lies_does_not_make_another_avatar():
+    one, other = (GAOfficialConfig(checkout=place, python=place) for place in ("a", "b"))
+    assert deciding_settings(one) == deciding_settings(other)
+    assert deciding_settings(one) != deciding_settings(replace(one, commit="1234567"))

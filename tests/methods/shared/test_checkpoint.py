@@ -81,3 +81,12 @@ def test_a_state_that_is_none_of_the_method_is_refused(tmp_path, state):
     fit = Fit(None, tmp_path, Budget(iterations=2), "cpu", 0, no_progress, "run")
     with pytest.raises(InputError, match="the state of this method"):
         train(Method(), lambda iteration: 0, fit, published_length=1, checkpoint_every_s=1.0)
+
+
+def test_a_failed_write_leaves_the_old_checkpoint(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    save_checkpoint(path, "run", {"x": 1})
+    with pytest.raises((AttributeError, TypeError, pickle.PicklingError, RuntimeError)):
+        save_checkpoint(path, "run", {"x": lambda: None})
+    assert load_checkpoint(path, "run", "cpu") == {"x": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.safetensors"]
