@@ -33,6 +33,7 @@ CAUSES = {
     r"resol\w+ host|name resolution|dns error|Connect\w*Error|connection|unreachable|timed? ?out": "no package index can "
     "be reached: check the network, or set PIP_INDEX_URL or PIP_FIND_LINKS to where the packages are",
     r"No matching distribution|not found in the package registry|no wheels|no version": "pip's sources lack a package",
+    r"ResolutionImpossible": "pip's sources lack a package, or a constraint of pip's configuration excludes it",
 }
 
 
