@@ -4,6 +4,7 @@ uv and pip install the same files, with the same hashes, from the same sources: 
 a build of PyTorch asked for, its CPU build is taken if one of these sources has it.
 """
 
+import ast
 import os
 import re
 import shutil
@@ -23,6 +24,8 @@ SETTINGS = {
     "trusted-host": "UV_INSECURE_HOST",
     "cert": "SSL_CERT_FILE",
     "default-timeout": "UV_HTTP_TIMEOUT",
+    "timeout": "UV_HTTP_TIMEOUT",
+    "proxy": "ALL_PROXY",
 }
 """What uv calls pip's settings."""
 CAUSES = {
@@ -30,6 +33,7 @@ CAUSES = {
     r"resol\w+ host|name resolution|dns error|Connect\w*Error|connection|unreachable|timed? ?out": "no package index can "
     "be reached: check the network, or set PIP_INDEX_URL or PIP_FIND_LINKS to where the packages are",
     r"No matching distribution|not found in the package registry|no wheels|no version": "pip's sources lack a package",
+    r"ResolutionImpossible": "pip's sources lack a package, or a constraint of pip's configuration excludes it",
 }
 
 
@@ -39,6 +43,8 @@ class Failed(Exception):
 
 def check_machine(build):
     """Raise for what would fail after minutes of installing: Python, compiler, headers, disk."""
+    if build and build not in GB:
+        raise Failed(f"TORCH is one of {', '.join(GB)}, not {build}")
     if not (3, 11) <= sys.version_info < (3, 14):
         version = ".".join(map(str, sys.version_info[:3]))
         raise Failed(
@@ -62,9 +68,10 @@ def uv_environment(python):
     ).stdout
     found = {}
     for section in ("global", "install", ":env:"):
-        found |= dict(re.findall(rf"^{section}\.([\w-]+)='(.*)'$", listed, re.MULTILINE))
+        values = re.findall(rf"^{section}\.([\w-]+)=(.*)$", listed, re.MULTILINE)
+        found |= {name: ast.literal_eval(value) for name, value in values}
     given = {
-        SETTINGS[name]: " ".join(value.replace("\\n", " ").split())
+        SETTINGS[name]: " ".join(value.split())
         for name, value in found.items()
         if name in SETTINGS and value.strip()
     }
@@ -126,12 +133,20 @@ class Installer:
         return f"{cause or lines[-1].strip()} (what was printed is in {self.log})"
 
 
+def _has_pip(python):
+    """Whether an environment's Python starts and has pip, which comes last when an environment is made."""
+    command = [str(python), "-m", "pip", "--version"]
+    return python.exists() and not subprocess.run(command, capture_output=True, check=False).returncode
+
+
 def main(folder, build=""):
     """Install into ``folder``; raise `Failed` with a sentence for the user."""
     check_machine(build)
-    if not (folder / "bin/python").exists():
+    if not _has_pip(folder / "bin/python"):
+        # What an interrupted set-up left, or an environment whose Python was removed, is replaced.
+        again = ["--clear"] if (folder / "pyvenv.cfg").exists() else []
         made = subprocess.run(
-            [sys.executable, "-m", "venv", str(folder)], capture_output=True, text=True, check=False
+            [sys.executable, "-m", "venv", *again, str(folder)], capture_output=True, text=True, check=False
         )
         if made.returncode:
             lines = (made.stdout + made.stderr).split()

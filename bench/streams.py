@@ -15,8 +15,14 @@ IN_ASCII = dict(
 
 
 def prepare_streams() -> None:
-    """Let standard output and error replace characters that their encoding lacks instead of raising an error."""
+    """Let standard output and error replace characters that their encoding lacks instead of raising an error.
+
+    A stream that the caller has closed (``headbench … >&-``) is discarded.
+    """
     codecs.register_error("headbench", _in_ascii)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - open until the process ends
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="headbench")

@@ -31,6 +31,12 @@ def printed(capsys, monkeypatch):
     return printed
 
 
+def test_a_closed_standard_output_is_no_error(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)  # as Python does for `headbench list presets >&-`
+    assert cli.main(["list", "presets"]) == 0
+    sys.stdout.close()
+
+
 @pytest.mark.parametrize(
     "words",
     [
