@@ -38,7 +38,7 @@ def psnr_by_heart(spec, clip, key, folder, iterations, settings):
 
 
 @pytest.mark.parametrize(
-    ("iterations", "enough_db"), [(250, 27.0), pytest.param(500, 45.0, marks=pytest.mark.slow)]
+    ("iterations", "enough_db"), [(120, 27.0), pytest.param(500, 45.0, marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize("spec", [FLASHAVATAR, GA, GBS, OURS, RGBAVATAR], ids=lambda spec: spec.name)
 def test_one_frame_is_learnt_by_heart(clip, tmp_path, spec, iterations, enough_db):

@@ -21,7 +21,7 @@ from headbench.reports.robustness.sheets import SHEET_FILE, table, write_extreme
 
 from ...datasets.flat_renderer import flat_pictures
 
-PARAMETERS = ExtremesSettings("run", views=2, beyond=15.0, dimensions=3, samples=2, path=2).parameters
+PARAMETERS = ExtremesSettings("run", views=2, beyond=15.0, dimensions=2, samples=2, path=2).parameters
 FRAMES, SAMPLES = 2 + 2 * 2 + 2, 2 * 2
 
 
@@ -31,7 +31,7 @@ def job(tmp_path_factory):
     root = tmp_path_factory.mktemp("truth")
     how = {"performance": "full", "workers": 1, "tracking_error": 1.0, "samples_per_pixel": 4}
     with flat_pictures():  # of which the truth needs none
-        (capture,) = synthesize(root / "data", cameras=3, timesteps=8, size=(48, 70), **how)
+        (capture,) = synthesize(root / "data", cameras=3, timesteps=8, size=(32, 46), **how)
     condition = Condition(drive=Named("extremes", PARAMETERS))
     config = RunConfig(
         data=str(root / "data"), out=str(root / "run"), methods=("mean-image",), conditions=(condition,)

@@ -55,13 +55,6 @@ def test_a_comparison_tells_size_certainty_and_verdict():
     assert three.wins == 0
 
 
-def test_direction_decides_who_is_better():
-    rows = rows_of(9, metric="lpips")
-    (found,) = compare(rows, PAIRS[:1], metric="lpips", higher_is_better=False)
-    assert found.verdict == "low is better"
-    assert found.wins == 0
-
-
 @pytest.mark.parametrize(
     ("subjects", "pairs", "verdict"),
     [
@@ -153,11 +146,6 @@ def test_equals_the_enumeration_of_all_assignments(values):
         sum(s * v for s, v in zip(signs, values)) for signs in itertools.product((1, -1), repeat=len(values))
     ]
     assert sign_flip_p(values) == pytest.approx(np.mean([abs(total) >= observed for total in sums]))
-
-
-def test_equals_scipys_permutation_test():
-    values = np.random.default_rng(3).normal(0.3, 1, 11)
-    assert sign_flip_p(values) == pytest.approx(permutation_p(values))
 
 
 @given(differences, st.floats(1e-6, 1e6))
@@ -284,14 +272,14 @@ def test_equivalence_is_corrected_over_the_pairs():
     assert {c.equivalent for c in compare(rows, pairs)} == {None}
 
 
-def two_tasks(subjects=8, gain=1.0, tasks=("novel_view", "self_reenactment")):
-    """Method a ahead of b by 1 in the first task and by ``1 + gain`` in the other, each give or take 0.1."""
+def two_tasks():
+    """Method a ahead of b by 1 in the first task and by 2 in the other, each give or take 0.1."""
     generator = np.random.default_rng(5)
     return pd.DataFrame(
-        row(m, "psnr", level * (1 + gain * i) + generator.normal(0, 0.1), f"s{s}", timestep=t, task=task)
+        row(m, "psnr", level * (1 + i) + generator.normal(0, 0.1), f"s{s}", timestep=t, task=task)
         for m, level in (("a", 1.0), ("b", 0.0))
-        for i, task in enumerate(tasks)
-        for s in range(subjects)
+        for i, task in enumerate(("novel_view", "self_reenactment"))
+        for s in range(8)
         for t in range(4)
     )
 
@@ -307,12 +295,6 @@ def test_an_interaction_is_a_difference_of_differences():
     assert found.low < expected.mean() < found.high
     assert found.high - found.low < 0.4
     assert found.verdict == "the differences differ"
-
-
-def test_equal_differences_are_no_interaction():
-    (found,) = compare(two_tasks(gain=0.0), [("a", "b")], minus="self_reenactment")
-    assert found.low < 0 < found.high
-    assert found.verdict == "no significant difference"
 
 
 def test_an_interaction_takes_both_tasks():

@@ -22,6 +22,7 @@ from ..toy import toy_head
 from .heads import subdivided
 
 HEAD = procedural_head("2020")
+SMALL = toy_head(32)
 SETTINGS = RefitSettings()
 
 
@@ -54,23 +55,24 @@ def test_weights_are_those_of_the_regions():
     assert len(fitted_vertices(HEAD, RefitSettings(eyeballs=0.0))[0]) == len(HEAD.regions["face"])
 
 
-def test_another_topology_in_another_place_is_matched(shape):
+def test_another_topology_in_another_place_is_matched():
     """The same surface cut finer, vertices in random order, turned and shifted: counterparts are the old vertices."""
-    source = subdivided(HEAD)
-    assert not same_topology(source, HEAD)
+    source = subdivided(SMALL)
+    assert not same_topology(source, SMALL)
+    shape = np.random.default_rng(4).normal(size=SMALL.shape_basis.shape[2])
     neutral = source.template + source.shape_basis @ shape
     turn = Rotation.from_rotvec([0.1, -0.2, 0.15]).as_matrix()
     moved = neutral @ turn.T + [0.02, -0.03, 0.01]
-    matching = match(source, moved, HEAD, RefitSettings(prior_mm=0.001))
-    assert len(matching.vertices) > 0.95 * len(fitted_vertices(HEAD, SETTINGS)[0])
+    matching = match(source, moved, SMALL, RefitSettings(prior_mm=0.001))
+    assert len(matching.vertices) > 0.95 * len(fitted_vertices(SMALL, SETTINGS)[0])
     np.testing.assert_allclose(matching.counterparts.sum(axis=1), 1)
-    wanted = HEAD.template + HEAD.shape_basis @ shape
+    wanted = SMALL.template + SMALL.shape_basis @ shape
     aligned = (matching.counterparts @ moved) @ matching.alignment[:3, :3].T + matching.alignment[:3, 3]
     # Identity and alignment may share a rigid part, and counterparts a slide along the surface.
     placed = aligned_surface(aligned, wanted[matching.vertices])
     assert np.linalg.norm(aligned - placed, axis=1).mean() < 0.5e-3
-    fitted = (HEAD.template + HEAD.shape_basis @ matching.shape)[matching.vertices]
-    assert np.linalg.norm(fitted - aligned, axis=1).mean() < 0.2e-3
+    fitted = (SMALL.template + SMALL.shape_basis @ matching.shape)[matching.vertices]
+    assert np.linalg.norm(fitted - aligned, axis=1).mean() < 0.4e-3
 
 
 def aligned_surface(points, other):
