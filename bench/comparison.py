@@ -104,22 +104,23 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
     methods = resolve_methods(comparison)
     resolve_metrics(comparison)
     check_device(comparison.device)
-    out = Path(settings.out)
+    arguments, out = config.capture_arguments(), Path(settings.out)
     check_kind(out, "a run")
     check_output_folder(out)
     beside = is_quick and comparison.device == "cpu" and processor_count() > 1
     with _log_file(out):
         log.info(
-            "Rendering images of a synthetic head, training %s on a part of them, and comparing their renders with the others: %s on "
+            "Renders images of a synthetic head, trains %s on a part of them, and compares their renders with the other images. Takes %s on "
             "two cores. Everything is written to %s.",
-            counted(sum(not method.spec.trivial for method in methods), "method"),
+            f"{counted(sum(not m.spec.trivial for m in methods), 'method')} and "
+            f"{counted(sum(m.spec.trivial for m in methods), 'trivial baseline')}",
             DURATIONS.get(comparison.preset, "more than 16 minutes"),
             out,
         )
         start = time.perf_counter()
         with locked(out), show_progress("images of the capture") as report:
             make = resolve(get("datasets", "synthetic").implementation)
-            make(**config.capture_arguments(), progress=report)
+            make(**arguments, progress=report)
         execution = Execution("processes") if beside else None
         result = _run(comparison, execution, capture_seconds=round(time.perf_counter() - start, 3))
     return result._replace(text=f"{result.text}\n{ONE_SUBJECT}")

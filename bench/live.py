@@ -12,9 +12,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Self
 
+from .terminal import wrapped
+
 BLOCKS, ASCII_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 BAR, ASCII_BAR = "█░", "#."
-BAR_WIDTH, CURVE_WIDTH, MOST_CELLS = 24, 24, 8
+BAR_WIDTH, CURVE_WIDTH, MOST_CELLS = 12, 24, 8
 """Width of the bar and of a curve in characters, and number of cells with separate lines."""
 LOSS = re.compile(r"\bloss (\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)")
 """Matches the loss in a method's progress note."""
@@ -173,7 +175,10 @@ def displayed() -> Iterator[Display]:
 
 
 class TerminalHandler(logging.StreamHandler):
-    """Writes messages to standard error, above the display if there is one."""
+    """Writes messages to standard error, wrapped, above the display if there is one."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return wrapped(super().format(record), self.stream)
 
     def emit(self, record: logging.LogRecord) -> None:
         display = current()

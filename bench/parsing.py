@@ -5,9 +5,10 @@
 import inspect
 import io
 import json as json_module
+import os
 import re
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, redirect_stderr, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, redirect_stderr, suppress
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
@@ -58,6 +59,18 @@ def with_home(word: str) -> str:
     return match[1] + expand_home(match[2], "command line")
 
 
+@contextmanager
+def _styled_as_wanted() -> Iterator[None]:
+    """Within the block, where the parser writes help, NO_COLOR means a terminal without styles, which the parser knows."""
+    terminal = os.environ.get("TERM", "")
+    if os.environ.get("NO_COLOR"):
+        os.environ["TERM"] = "dumb"
+    try:
+        yield
+    finally:
+        os.environ["TERM"] = terminal
+
+
 def _parse(command: Any, program: str, words: Sequence[str]) -> Any:
     """Parse arguments; return the result of ``command``.
 
@@ -66,7 +79,7 @@ def _parse(command: Any, program: str, words: Sequence[str]) -> Any:
     config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     printed = io.StringIO()
     try:
-        with redirect_stderr(printed):
+        with redirect_stderr(printed), _styled_as_wanted():
             return tyro.cli(command, prog=program, args=words, config=config, registry=_values())
     except SystemExit as ended:
         if not ended.code:

@@ -247,6 +247,14 @@ def _text(task: str, found: Sequence[tuple[MetricSpec, Sequence[PairedComparison
             digits = spec.digits + 1
             bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f} {c.high:+.{digits}f}"
             verdict = "; ".join(filter(None, [c.verdict, equivalence_text(c, spec.unit)]))
-            lines.append([name, f"{c.difference:+.{digits}f}", bounds, f"{c.p_holm:.4f}", verdict])
+            lines.append(
+                [
+                    name,
+                    f"{c.difference:+.{digits}f}",
+                    bounds,
+                    f"{c.p_holm:.4f}" if c.testable else "-",
+                    verdict,
+                ]
+            )
     heads = ["Methods", "Difference", f"{100 * (1 - level):g} % interval", "p", "Conclusion"]
     return table(heads, lines, title=TASK_TITLES.get(task, task) or AVATAR_TITLE)

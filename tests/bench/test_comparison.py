@@ -32,7 +32,7 @@ def test_the_demo_says_how_long_it_takes(monkeypatch, tmp_path, preset, cores, e
     assert (execution and execution.executor) == executor
     assert bool(config.conditions[1:]) == (preset == "demo")  # coded avatars
     first = (tmp_path / "out" / "run.log").read_text().splitlines()[0]
-    assert "training 6 methods" in first
+    assert "trains 6 methods" in first
     assert takes in first
     assert first.endswith(f"{out}.")
     assert result.text.startswith("the table\nOne subject ranks nobody")
