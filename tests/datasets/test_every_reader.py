@@ -18,6 +18,7 @@ COMMANDS = {
 }
 
 
+@pytest.mark.commands
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_read_by_a_plugins_reader(plain_folder, tmp_path, command):
     options, files = COMMANDS[command]
@@ -29,6 +30,7 @@ def test_commands_read_by_a_plugins_reader(plain_folder, tmp_path, command):
             assert probe_image(tmp_path / "out" / file).width > 100
 
 
+@pytest.mark.commands
 def test_commands_take_settings_of_the_reader(plain_folder, tmp_path, capsys):
     labels = tmp_path / "labels.json"
     labels.write_text('{"0": "a hand"}')

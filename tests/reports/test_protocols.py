@@ -131,6 +131,7 @@ def test_differences_from_the_published_conditions_are_said(runs):
     assert "Mean over frames, then subjects" in table_text([GALLERY], "md", protocol="mogaface-2026")
 
 
+@pytest.mark.commands
 def test_every_choice_is_tabled_as_a_difference(runs, tmp_path):
     result = protocols_command(ProtocolsSettings((str(GALLERY),), methods=("ga", "ours")), None)
     values = result.data["values"]

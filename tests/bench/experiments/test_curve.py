@@ -145,6 +145,7 @@ def test_pictures_are_counted_over_timesteps_and_cameras(make_run, plugin):
     assert points == [(0.5, 1.0), (2.0, 1.0)]
 
 
+@pytest.mark.commands
 def test_tracking_error_changes_poses_alone(plugin, tmp_path):
     capture = tmp_path / "capture"
     with flat_pictures():
@@ -288,6 +289,7 @@ def test_points_that_are_there_are_kept(make_run, plugin):
         curve_run(settings(run / "curve"))
 
 
+@pytest.mark.commands
 def test_curves_of_several_subjects_and_methods_are_joined(make_run, tmp_path):
     methods, subjects = ("curve_plugin:METHOD", "curve_plugin:TIMED"), ("ball-a", "ball-bee")
     whole = curve_run(settings(make_run(*methods, subjects=subjects), fractions=("1",)))

@@ -24,6 +24,7 @@ from ..lint.good_capture import FRONTAL, read_rgb
 from ..tiny_capture import look_at
 
 
+@pytest.mark.commands
 def test_picture_numbers_and_text(capture, clip, tmp_path):
     calls = []
     settings = InspectSettings(str(capture.union), out=str(tmp_path / "out"), timesteps=1, cameras=2)

@@ -53,6 +53,7 @@ def test_bad_input(settings):
         lint(settings)
 
 
+@pytest.mark.commands
 def test_exit_codes_and_json_on_the_command_line(good, capsys):
     arguments = ["lint", str(good.union), "--json", "--views", "4"]
     assert main(arguments) == 0

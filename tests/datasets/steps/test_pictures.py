@@ -96,6 +96,7 @@ def test_colours_of_sixteen_clusters_differ():
     assert distances.min() > 20
 
 
+@pytest.mark.commands
 @pytest.mark.parametrize("variant", ["paper", "official"])
 def test_command_writes_pictures_and_numbers(pristine_capture, tmp_path, variant):
     settings = StepsSettings(str(pristine_capture.union), str(tmp_path), clusters=2, variant=variant)

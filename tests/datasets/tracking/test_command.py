@@ -21,6 +21,7 @@ def finished(patterned_capture, tmp_path_factory):
     return out, track_capture(TrackSettings(capture, str(out), against=capture))
 
 
+@pytest.mark.commands
 def test_the_tracked_capture_reads_back(finished, patterned_capture):
     old, new = read_capture(patterned_capture.union), read_capture(finished[1].data["capture"])
     assert {name: set(keys) for name, keys in new.splits.items()} == {
@@ -31,6 +32,7 @@ def test_the_tracked_capture_reads_back(finished, patterned_capture):
     assert any(abs(new.poses[t].translation - old.poses[t].translation).max() > 1e-5 for t in old.poses)
 
 
+@pytest.mark.commands
 def test_report_and_picture(finished):
     out, result = finished
     stored = json.loads((out / "track.json").read_text())

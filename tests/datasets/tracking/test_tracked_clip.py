@@ -17,6 +17,7 @@ def clip(patterned_capture):
     return read_capture(patterned_capture.union)
 
 
+@pytest.mark.commands
 def test_the_clip_has_other_tracking_and_the_same_frames(clip, tmp_path, monkeypatch):
     config = SimpleNamespace(out=str(tmp_path))
     one = with_tracking(clip, config, seed=1)

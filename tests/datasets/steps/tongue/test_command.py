@@ -74,6 +74,7 @@ def look(capture, out, **changes):
     return findings
 
 
+@pytest.mark.commands
 def test_decisions_overrides_and_exclusion(capture, tmp_path):
     findings = look(capture, tmp_path)
     path = tmp_path / DECISIONS_FILE
@@ -105,6 +106,7 @@ def test_decisions_overrides_and_exclusion(capture, tmp_path):
     assert {key.timestep: reason for key, reason in protocol.excluded}[6].startswith("tongue out")
 
 
+@pytest.mark.commands
 def test_given_threshold_is_used_and_bad_input_is_refused(capture, tmp_path):
     for name, value in (("threshold", -1.0), ("threshold", np.inf), ("cameras", 0), ("frames", 0)):
         with pytest.raises(InputError) as caught:
