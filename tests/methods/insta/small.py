@@ -28,7 +28,7 @@ SMALL = {
     "step": 0.004,
     "shell_outside": 0.02,
     "shell_inside": 0.01,
-    "occupancy_resolution": 24,
+    "occupancy_resolution": 16,
     "occupancy_every": 4,
     "samples_per_iteration": 2_000,
     "first_rays": 128,

@@ -45,7 +45,7 @@ def test_training_lowers_the_error_on_a_held_out_view(clip, tmp_path):
         avatar = Insta(config).fit(clip, tmp_path / str(n), Budget(iterations=n), **how)
         frame = avatar.render(clip.cameras[key.camera], clip.poses[key.timestep], clip.background)
         errors.append(np.square(frame.rgb - clip.image(key) / 255.0).mean())
-    # The toy's texture changes from triangle to triangle, finer than so small a grid can tell: it ends at 0.71.
+    # The toy's texture changes from triangle to triangle, finer than so small a grid can tell: it ends at 0.68.
     assert errors[1] < 0.8 * errors[0]
 
 
