@@ -1,6 +1,7 @@
 """The whole way from raw recordings to captures: what comes out, resuming, refusing, full disks."""
 
 import errno
+import tracemalloc
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -354,3 +355,18 @@ def test_images_are_never_enlarged(recording, tmp_path):
         prepared(recording, tmp_path / "out", downscale=1)
     assert error.value.key == "downscale"
     assert prepared(recording, tmp_path / "out", downscale=2)[0]["written"] == IMAGES
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_length_of_a_recording(tmp_path):
+    peaks = []
+    for frames in (6, 60):
+        sequences = {"EMO-1-shout+laugh": frames, "FREE": 2}
+        recording = write_recording(
+            tmp_path / str(frames), images=False, sequences=sequences, size=(800, 800)
+        )
+        tracemalloc.start()
+        prepared(recording, tmp_path / f"out-{frames}", downscale=1, workers=2)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] - peaks[0] < 10 * 800 * 800 * 3, "as much as ten of the 54 frames more"
