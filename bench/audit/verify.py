@@ -38,17 +38,7 @@ LEVELS = 1
 
 @dataclass
 class Findings:
-    """Results of a verification.
-
-    Attributes
-    ----------
-    mismatches : list[str]
-        Differences between a run and its record: place, expected and found.
-    files, values : int
-        Number of files and values that were compared.
-    unverified : dict[str, str]
-        Reasons why items could not be checked, by name.
-    """
+    """Differences between a run and its record, the numbers of files and values compared, and reasons why items were not, by name."""
 
     mismatches: list[str] = field(default_factory=list)
     files: int = 0

@@ -3,28 +3,166 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
-from ...bench.contracts import Camera, FloatArray, HeadPose, Progress, no_progress
+from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, Progress, no_progress
+from ...bench.errors import InputError
 from ...bench.io.files import digest, digest_file
+from ...bench.io.images import probe_image
 from ...bench.landmark_network import LandmarkNetwork
+from ...bench.protocol import evenly_with_ends
+from ...bench.tflite import open_network
 from ..clip import CaptureClip
+from ..ga.content_digests import content_digests
 from ..head.arrays import HeadArrays
 from ..head.subject import resting
-from ..images import write_image
+from ..images import read_mask, write_image
 from ..monocular.clip import check_subject, clip_of_track, subject_of
 from ..monocular.track import VIDEO, Track, VideoFrame
 from ..tracking.work import TRACKER_VERSION
+from .background import CHECKED, SAMPLES, Background, check_background, learn_background
 from .decode import TimedFrame, VideoInfo, probe_video, video_frames
-from .faces import FoundFaces, crop_around, find_faces
-from .masks import FrameView, MaskSource
-from .settings import VideoOptions
+from .faces import Crop, FoundFaces, crop_around, find_faces
+from .settings import BACKGROUND, MASKLESS, VideoOptions
+
+
+class SelfieSegmentation:
+    """The network of a file."""
+
+    def __init__(self, path: Path):
+        remedy = "It is in the wheel of mediapipe 0.10.21, as mediapipe/modules/selfie_segmentation/selfie_segmentation.tflite."
+        expected = "a network that segments a person"
+        self._network: Any = open_network(path, expected, remedy)
+        (self._input,), (self._output,) = (
+            self._network.get_input_details(),
+            self._network.get_output_details(),
+        )
+        _, self._height, self._width, _ = map(int, self._input["shape"])
+        shape = tuple(map(int, self._output["shape"]))
+        if shape != (1, self._height, self._width, 1):
+            raise InputError(path, "", expected, f"an output of shape {shape}")
+
+    def mask(self, image: ByteArray) -> ByteArray:
+        """(H, W) 8-bit coverage of the person in an (H, W, 3) image."""
+        size = (self._width, self._height)
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        self._network.set_tensor(self._input["index"], small[None])
+        self._network.invoke()
+        found: FloatArray = self._network.get_tensor(self._output["index"])[0, :, :, 0]
+        large = cv2.resize(found, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(np.rint(255 * large.clip(0, 1)), np.uint8)
+
+
+class FrameView(NamedTuple):
+    """The part of a video's frames that a clip shows, and its size in the clip."""
+
+    crop: Crop
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, crop: Crop, size: int) -> FrameView:
+        """The view of a crop whose longer side becomes ``size`` pixels, unless it is shorter."""
+        scale = min(1.0, size / max(crop.width, crop.height))
+        return cls(crop, max(1, round(crop.width * scale)), max(1, round(crop.height * scale)))
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the view by pixels of the frames."""
+        return self.width / self.crop.width
+
+    def image(self, frame: ByteArray) -> ByteArray:
+        """The view of a frame or a mask of its size."""
+        part = self.crop.of(frame)
+        if part.shape[:2] == (self.height, self.width):
+            return part
+        return np.asarray(cv2.resize(part, (self.width, self.height), interpolation=cv2.INTER_AREA), np.uint8)
+
+    def points(self, pixels: FloatArray) -> FloatArray:
+        """(..., 2) pixels of the view from those of a frame."""
+        scale = [self.width / self.crop.width, self.height / self.crop.height]
+        return (pixels - [self.crop.left, self.crop.top]) * scale
+
+
+class MaskSource:
+    """Masks according to the options."""
+
+    def __init__(self, options: VideoOptions):
+        if bool(options.segmentation) == bool(options.masks):
+            expected = "one of --segmentation FILE, --masks FOLDER, --masks background and --masks none"
+            remedy = (
+                "selfie_segmentation.tflite is in the wheel of mediapipe 0.10.21 (Apache-2.0), under "
+                "mediapipe/modules/selfie_segmentation: pip download --no-deps mediapipe==0.10.21, and unpack it."
+            )
+            found = "both" if options.masks else "none of them"
+            raise InputError("command line", "masks of a video", expected, found, remedy)
+        self.options = options
+        self.unsure: dict[int, float] = {}
+        """Of masks by the background, `HeadMask.unsure` by the number of the frame."""
+        self._network = SelfieSegmentation(Path(options.segmentation)) if options.segmentation else None
+        self._background: Background | None = None
+
+    def __bool__(self) -> bool:
+        """Whether frames are masked."""
+        return self.options.masks != MASKLESS
+
+    @property
+    def by_background(self) -> bool:
+        """Whether masks are computed by background subtraction."""
+        return self.options.masks == BACKGROUND
+
+    def prepare(self, numbers: Sequence[int], info: VideoInfo) -> str:
+        """Check the inputs of the masks of frames with these numbers; returns a digest of the inputs.
+
+        Raises `InputError` unless a folder of masks has one of the video's size for every frame.
+        """
+        if self._network is not None:
+            return digest_file(Path(self.options.segmentation))
+        if not self or self.by_background:
+            return self.options.masks
+        files = [self._file(number) for number in numbers]
+        for file in files:
+            found = probe_image(file)
+            if (found.width, found.height) != (info.width, info.height):
+                expected = f"{info.width}x{info.height} pixels, the size of the video"
+                raise InputError(file, "", expected, f"{found.width}x{found.height}")
+        return digest([*content_digests(files).values()])
+
+    def learn(self, path: Path, frames: Iterable[TimedFrame], faces: FoundFaces, view: FrameView) -> None:
+        """Learn the background from the frames of a video that show nobody's face, where masks are made from it.
+
+        Raises `InputError` as `learn_background` and `check_background`.
+        """
+        if not self.by_background:
+            return
+        empty = evenly_with_ends(np.flatnonzero(~faces.found & (faces.others == 0)).tolist(), SAMPLES)
+        shown = evenly_with_ends(np.flatnonzero(faces.found).tolist(), CHECKED)
+        chosen = {*faces.numbers[[*empty, *shown]].tolist()}
+        images = {frame.number: view.image(frame.image) for frame in frames if frame.number in chosen}
+        self._background = learn_background(path, [images[number] for number in faces.numbers[empty]])
+        pixels = view.points(faces.pixels[shown])
+        check_background(path, self._background, [images[number] for number in faces.numbers[shown]], pixels)
+
+    def mask(self, frame: TimedFrame, view: FrameView, face: FloatArray) -> ByteArray:
+        """(H, W) 8-bit coverage of the person in the view of a frame with landmarks ``face``, (L, 2) pixels of the frame."""
+        if self._network is not None:
+            return view.image(self._network.mask(frame.image))
+        if self._background is not None:
+            found = self._background.mask(view.image(frame.image), view.points(face))
+            self.unsure[frame.number] = found.unsure
+            return found.mask
+        return view.image(read_mask(self._file(frame.number), (frame.image.shape[1], frame.image.shape[0])))
+
+    def _file(self, number: int) -> Path:
+        return Path(self.options.masks) / f"{number:05d}.png"
+
 
 FACES, IMAGES, MASKS = "faces.npz", "images", "masks"
 USUAL_FOCAL = 1.0

@@ -33,19 +33,22 @@ from ..table_report import COMPARISON, layouts, table_of
 from ..tables import AVATAR_TITLE, TITLES, Table
 from ..writers import render_page
 from .frames import Opening, Pictures, ShownFrame, choose_pictures, frame_values, opening, worst_frames
-from .sections import cards_of, failed_cells, loss_curves, record_of
-from .settings import MAX_MB, MAX_SPLIT_MB, PageSettings
-from .split import (
+from .sections import (
     ENTRY_BYTES,
     FILE_BYTES,
     INDEX,
     PictureFile,
+    cards_of,
     check_folder,
+    failed_cells,
+    loss_curves,
+    record_of,
     remove_others,
     split,
+    verdict,
     write_pictures,
 )
-from .verdict import verdict
+from .settings import MAX_MB, MAX_SPLIT_MB, PageSettings
 
 HERE = Path(__file__).parent
 MEGABYTE = 10**6

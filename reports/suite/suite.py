@@ -5,21 +5,190 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
+from math import sqrt
 from pathlib import Path
+from statistics import fmean, stdev, variance
 
 from ...bench.engine.scoring import FULL
 from ...bench.engine.store import RunFolder
 from ...bench.experiments.suite_settings import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, SEEDS_RUN, TRACKED
+from ...bench.progress import counted
+from ...bench.protocol import TASK_TITLES
 from ...bench.rows import ALL
+from ..aggregate import means_by_seed, whole_images
 from ..runs import WHOLE, FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
+from ..statistics.comparisons import PairedComparison, compare, subjects_needed
+from ..statistics.paired import LEVEL as TEST_LEVEL
 from ..statistics.primary import PAIR, primary_section
 from ..table_report import Columns, table_of
 from ..tables import Column, Table, TableCell, TableRow
-from ..writers import to_markdown
-from .ablations import ablation_table, difference_table, meaning_of
+from ..writers import pipe_table, to_markdown
 from .extremes import extremes_section, read_extremes
-from .variance import variance_section
+
+FIRST_TASK = "novel_view"
+
+
+def ablation_table(runs: RunSet, method: str, names: Mapping[str, str], *, crossed: bool = False) -> Table:
+    """Differences of ablations from a method, as `difference_table`.
+
+    Parameters
+    ----------
+    runs : RunSet
+        A run with only ``method`` itself and its ablations.
+    method : str
+        Label of the method, including its condition of tracking for ablations under this condition.
+    names : mapping of str
+        Name of each ablation by its label.
+    """
+    pairs = [(label, method) for label in names]
+    meaning = meaning_of("Ablation minus method")
+    if crossed:
+        both = "Ablation minus method in novel views, minus the same difference in self-reenactment"
+        meaning = f"{meaning_of(both)} It is 0 where an ablation changes both tasks alike."
+    return difference_table(runs, pairs, names, "Ablations", meaning, "ablations", crossed=crossed)
+
+
+def meaning_of(subtracted: str) -> str:
+    """Sentence about the cells of a table of differences."""
+    return f"{subtracted}, mean over subjects and its {100 * (1 - TEST_LEVEL):g} % interval."
+
+
+def difference_table(
+    runs: RunSet,
+    pairs: Sequence[tuple[str, str]],
+    names: Mapping[str, str],
+    title: str,
+    meaning: str,
+    family: str,
+    *,
+    crossed: bool = False,
+) -> Table:
+    """Paired differences, in the machine-independent columns of the comparison table.
+
+    ``crossed``: differences in novel views minus those in self-reenactment, which show whether a change helps more in one of
+    the tasks. Speeds are left out, since those of consecutive runs of the same method differ by up to a tenth.
+
+    Parameters
+    ----------
+    runs : RunSet
+        A run with the labels of ``pairs`` alone.
+    pairs : sequence of tuple of str
+        Pairs of labels, with one row for each difference, first minus second.
+    names : mapping of str
+        Name of each row by the first label.
+    title, meaning, family : str
+        Heading of the rows; sentence about the cells; family of the correction of a column's tests.
+    """
+    runs = runs.by_camera
+    table = table_of(runs)
+    bound = {spec.name for spec in runs.metrics if spec.machine_bound}
+    kept = tuple(column for column in table.columns if column.metric not in bound)
+    if crossed:
+        others = [column for column in kept if column.task not in ("", FIRST_TASK)]
+        kept = tuple(replace(c, title=f"{TASK_TITLES[FIRST_TASK]} minus {c.title.lower()}") for c in others)
+    shown, columns, tested = [], [], []
+    for column in kept:
+        found = compare(
+            *(runs.rows, pairs),
+            task=FIRST_TASK if crossed else column.task,
+            minus=column.task if crossed else "",
+            metric=column.metric,
+            higher_is_better=column.higher_is_better,
+            level=TEST_LEVEL,
+        )
+        if not column.task and all(each.difference is None for each in found):
+            continue  # metrics of coded avatars, which conditions do not have
+        shown.append(column)
+        columns.append([_cell(each, column.digits) for each in found])
+        tested += [each for each in found if each.p_holm is not None]
+    versions = {row.method: row.version for row in table.rows}
+    rows = tuple(
+        TableRow(names[label], versions[label], False, cells)
+        for (label, _), cells in zip(pairs, zip(*columns), strict=True)
+    )
+    marking = _marking(tested, meaning, family)
+    return replace(table, columns=tuple(shown), groups=((title, rows),), notes=(), marking=marking)
+
+
+def _marking(tested: Sequence[PairedComparison], meaning: str, family: str) -> str:
+    test = f"exact sign-flip test over subjects, Holm over the {family} of a column, {TEST_LEVEL:.0%}"
+    if any(each.testable for each in tested) or not tested:
+        return f"{meaning} Bold: not 0 ({test})."
+    first = tested[0]
+    needed = subjects_needed(TEST_LEVEL, first.family)
+    subjects = counted(first.subjects, "subject")
+    return f"{meaning} {subjects} are too few to test whether they differ from 0 (needed: {needed}; {test})."
+
+
+def _cell(found: PairedComparison, digits: int) -> TableCell:
+    if found.difference is None:
+        return TableCell("missing", None, found.reason)
+    # One digit more than the table, since differences are smaller than values.
+    text = found.text(digits + 1)
+    differs = found.p_holm is not None and found.p_holm <= TEST_LEVEL
+    return TableCell("ok", found.difference, text, rank=1 if differs else None)
+
+
+COMPARED = "psnr"
+
+
+def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
+    """A table of standard deviations as Markdown, a row for each method and task and for the difference of ``pair``; "" with one seed.
+
+    Between subjects: of the means over seeds. Within subjects: of seeds about the mean of their subject, pooled over subjects
+    (the square root of the mean variance). Subjects without all seeds are left out.
+    """
+    runs = runs.by_camera
+    spec = next((spec for spec in runs.metrics if spec.name == COMPARED), None)
+    if spec is None or len(runs.rows.seeds(ALL)) < 2:
+        return ""
+    lines = [
+        ["", "task", "subjects", "seeds", f"mean ({spec.unit})", "SD between subjects", "SD within subjects"]
+    ]
+    lines.append(["---"] * len(lines[0]))
+    for task in runs.tasks:
+        values = {
+            method: means_by_seed(whole_images(runs.rows, method, COMPARED, task)) for method in runs.ranked
+        }
+        if {*pair} <= {*values}:
+            values[f"{pair[0]} - {pair[1]}"] = difference_by_seed(values, pair)
+        for name, by_seed in values.items():
+            if found := components(by_seed):
+                subjects, mean, between, within = found
+                shown = f"{mean:+.2f}" if name not in runs.ranked else f"{mean:.2f}"
+                counts = [str(subjects), str(len(by_seed))]
+                title = TASK_TITLES.get(task, task)
+                lines.append([name, title, *counts, shown, f"{between:.3f}", f"{within:.3f}"])
+    table = pipe_table(lines)
+    how = (
+        "Standard deviations: between subjects, of the means over seeds; within subjects, over seeds, pooled. "
+        "Differences are between trainings with the same seed."
+    )
+    return f"## Variance between and within subjects (exploratory)\n\n{table}\n\n{how}"
+
+
+def difference_by_seed(
+    values: Mapping[str, Mapping[int, Mapping[str, float]]], pair: tuple[str, str]
+) -> dict[int, dict[str, float]]:
+    """First minus second of a pair by seed and subject."""
+    first, second = (values[name] for name in pair)
+    return {
+        seed: {s: first[seed][s] - second[seed][s] for s in first[seed].keys() & second[seed].keys()}
+        for seed in first.keys() & second.keys()
+    }
+
+
+def components(by_seed: Mapping[int, Mapping[str, float]]) -> tuple[int, float, float, float] | None:
+    """Number of subjects with every seed, mean, standard deviations between and within; None with fewer than two of either."""
+    subjects = sorted(set.intersection(*(set(means) for means in by_seed.values()))) if by_seed else []
+    if len(by_seed) < 2 or len(subjects) < 2:
+        return None
+    values = {subject: [means[subject] for means in by_seed.values()] for subject in subjects}
+    centres = [fmean(own) for own in values.values()]
+    within = sqrt(fmean(variance(own) for own in values.values()))
+    return len(subjects), fmean(centres), stdev(centres), within
+
 
 NOVEL, METRIC = "novel_view", "psnr"
 DROP = "Drop"

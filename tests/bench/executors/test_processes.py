@@ -14,8 +14,7 @@ from headbench.bench.engine.store import RunFolder
 from headbench.bench.engine.tasks import _Run
 from headbench.bench.errors import InputError
 from headbench.bench.executors.outcome import read_outcome, write_outcome
-from headbench.bench.executors.processes import Processes
-from headbench.bench.executors.schedule import Schedule
+from headbench.bench.executors.schedule import Processes, Schedule
 from headbench.bench.executors.settings import Execution
 from headbench.bench.executors.status import CellState, time_left
 from headbench.bench.executors.task import Task

@@ -16,8 +16,8 @@ from headbench.bench.io.lock import locked
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
 from headbench.datasets.head.subject import PosedSubject
-from headbench.datasets.nersemble import frames as image_pool
 from headbench.datasets.nersemble import prepare, sequence
+from headbench.datasets.nersemble import prepare as image_pool
 from headbench.datasets.nersemble.command import prepare_nersemble
 from headbench.datasets.nersemble.prepare import RECORD_FILE
 from headbench.datasets.nersemble.recording import COLOUR_FILE, read_calibration

@@ -8,7 +8,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.nersemble import sequence as sequence_module
-from headbench.datasets.nersemble.frames import read_frames
+from headbench.datasets.nersemble.prepare import read_frames
 from headbench.datasets.nersemble.recording import participant, read_calibration
 from headbench.datasets.nersemble.sequence import check_boxes, probe_video, read_sequence
 

@@ -8,20 +8,20 @@ import pytest
 
 from headbench.datasets.synthetic.performance import CONTROLS, Performed
 from headbench.datasets.synthetic.plan import FRONTAL
-from headbench.datasets.synthetic.recording import (
+from headbench.datasets.synthetic.renderer import (
     APART_PIXELS,
     BALANCE,
     EXPOSURE,
     GAMMA,
     MATTE_METRES,
     MOST,
+    develop,
     draw_response,
     exposed,
     matte,
     outline,
     sub_frames,
 )
-from headbench.datasets.synthetic.renderer import develop
 
 METRE = 1000.0  # pixels of a metre
 

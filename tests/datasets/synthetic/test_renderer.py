@@ -9,8 +9,7 @@ from skimage.data import lbp_frontal_face_cascade_filename
 from skimage.feature import Cascade
 
 from headbench.datasets.synthetic.plan import FRONTAL, SyntheticSettings, plan_subject
-from headbench.datasets.synthetic.recording import outline
-from headbench.datasets.synthetic.renderer import CaptureRenderer
+from headbench.datasets.synthetic.renderer import CaptureRenderer, outline
 
 from ..tiny_capture import projected
 from .conftest import settled

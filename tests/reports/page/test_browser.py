@@ -6,7 +6,7 @@ import pytest
 
 from headbench.bench.contracts import FrameKey
 from headbench.bench.engine.store import RunFolder
-from headbench.reports.page import split
+from headbench.reports.page import sections
 from headbench.reports.page.report import write_report
 from headbench.reports.page.settings import PageSettings
 
@@ -183,7 +183,7 @@ def test_a_view_opens_again_by_its_address(opened, toy_run):
 
 
 def test_pictures_apart_are_loaded_when_they_are_shown(opened, toy_run, monkeypatch):
-    monkeypatch.setattr(split, "FILE_BYTES", 300)
+    monkeypatch.setattr(sections, "FILE_BYTES", 300)
     expected = pixels(opened(toy_run), "toy")
     tab = opened(toy_run, split=True)
     assert pixels(tab, "toy") == expected

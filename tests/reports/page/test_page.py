@@ -12,7 +12,7 @@ from headbench.bench.contracts import FrameKey
 from headbench.bench.engine.config import RunOptions
 from headbench.bench.errors import InputError
 from headbench.bench.rows import ALL, Rows
-from headbench.reports.page import frames, split
+from headbench.reports.page import frames, sections
 from headbench.reports.page.frames import Pictures, ShownFrame, choose_pictures, frame_values, opening, spread
 from headbench.reports.page.report import write_page, write_report
 from headbench.reports.page.sections import loss_curves
@@ -324,7 +324,7 @@ def test_one_page_of_two_runs(page, toy_run, make_run):
 
 
 def test_pictures_apart_are_those_of_one_file(toy_page, toy_run, tmp_path, monkeypatch):
-    monkeypatch.setattr(split, "FILE_BYTES", 300)
+    monkeypatch.setattr(sections, "FILE_BYTES", 300)
     single = toy_page
     folder = tmp_path / "folder"
     (folder / "pictures").mkdir(parents=True)

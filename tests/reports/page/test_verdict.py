@@ -5,7 +5,7 @@ import re
 import pytest
 
 from headbench.bench.rows import ALL, Rows
-from headbench.reports.page.verdict import verdict
+from headbench.reports.page.sections import verdict
 from headbench.reports.runs import RunData, RunSet
 from headbench.reports.statistics.command import CompareSettings, compare_methods
 

@@ -8,7 +8,7 @@ from headbench.bench.engine.store import RunFolder
 from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from headbench.reports.runs import RunSet
 from headbench.reports.statistics.comparisons import PairedComparison
-from headbench.reports.suite.ablations import _cell, ablation_table
+from headbench.reports.suite.suite import _cell, ablation_table
 from headbench.reports.table_report import table_of
 
 

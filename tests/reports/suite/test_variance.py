@@ -10,8 +10,16 @@ import pytest
 from headbench.bench.engine.store import RunFolder
 from headbench.reports.runs import RunSet
 from headbench.reports.suite.extremes import extremes_section, read_extremes
-from headbench.reports.suite.suite import CROSSED, ENDPOINTS, LARGE, condition_table, drop_table, suite_report
-from headbench.reports.suite.variance import components, variance_section
+from headbench.reports.suite.suite import (
+    CROSSED,
+    ENDPOINTS,
+    LARGE,
+    components,
+    condition_table,
+    drop_table,
+    suite_report,
+    variance_section,
+)
 from headbench.reports.table_report import table_of
 
 PSNR = {

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from headbench.methods.avatars.views import direction_of, orbit_camera
-from headbench.methods.avatars.web.export import draw
-from headbench.methods.avatars.web.payload import decode, encode
+from headbench.methods.avatars.web.export import decode, draw, encode
 
 SIDE = 200
 pytestmark = pytest.mark.commands

@@ -11,8 +11,7 @@ import pytest
 from headbench.bench.experiments.extremes import head_center
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.open import open_clip
-from headbench.methods.avatars.web.export import training_images
-from headbench.methods.avatars.web.payload import decode, encode
+from headbench.methods.avatars.web.export import decode, encode, training_images
 
 CENTER = np.array([0.0, 0.0, 1.0])
 
