@@ -7,8 +7,8 @@ import io
 import json as json_module
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stderr, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, redirect_stderr, suppress
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
@@ -20,6 +20,7 @@ from .errors import ExitCode, HeadbenchError
 from .io.files import check_kind, expand_home, to_jsonable
 from .io.lock import locked
 from .options import check_dependent, given_options
+from .process import environment_variable
 from .progress import log_to_terminal, progress
 from .registry import Plugin, discover, get, resolve
 from .specs import HELP, CommandSpec
@@ -59,18 +60,6 @@ def with_home(word: str) -> str:
     return match[1] + expand_home(match[2], "command line")
 
 
-@contextmanager
-def _styled_as_wanted() -> Iterator[None]:
-    """Within the block, where the parser writes help, NO_COLOR means a terminal without styles, which the parser knows."""
-    terminal = os.environ.get("TERM", "")
-    if os.environ.get("NO_COLOR"):
-        os.environ["TERM"] = "dumb"
-    try:
-        yield
-    finally:
-        os.environ["TERM"] = terminal
-
-
 def _parse(command: Any, program: str, words: Sequence[str]) -> Any:
     """Parse arguments; return the result of ``command``.
 
@@ -78,8 +67,11 @@ def _parse(command: Any, program: str, words: Sequence[str]) -> Any:
     """
     config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
     printed = io.StringIO()
+    terminal = (
+        "dumb" if os.environ.get("NO_COLOR") else None
+    )  # the parser knows such terminals, but not the variable
     try:
-        with redirect_stderr(printed), _styled_as_wanted():
+        with redirect_stderr(printed), environment_variable("TERM", terminal):
             return tyro.cli(command, prog=program, args=words, config=config, registry=_values())
     except SystemExit as ended:
         if not ended.code:

@@ -1,14 +1,13 @@
-"""Runs tasks on an executor: submits them, polls their results and restarts lost tasks."""
+"""Runs tasks on an executor: submits them, polls their results and restarts lost tasks; and the executor ``processes``."""
 
 from __future__ import annotations
 
 import logging
 import multiprocessing
-import os
 import signal
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing.connection import Connection, wait
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..machine import processor_count
+from ..process import environment_variable
 from ..progress import TasksLeft, progress
 from ..start import end_with_parent, starting_workers
 from .outcome import TaskOutcome, forget_outcome, read_outcome, write_outcome
@@ -117,7 +117,10 @@ class Processes:
     def _start(self) -> _Process:
         ours, theirs = multiprocessing.Pipe()
         process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs,))
-        with starting_workers(), _threads(self._threads):
+        threads = (
+            None if self._threads is None else str(self._threads)
+        )  # libraries read it when they are imported
+        with starting_workers(), environment_variable("OMP_NUM_THREADS", threads):
             process.start()
         theirs.close()
         started = _Process(process, ours)
@@ -140,21 +143,6 @@ def _serve(connection: Connection) -> None:
         except Exception as raised:  # noqa: BLE001 - the other process reports it
             error = raised
         connection.send(error)
-
-
-@contextmanager
-def _threads(count: int | None) -> Iterator[None]:
-    """Set the number of threads of processes started in the block; libraries read it when they are imported."""
-    before = os.environ.get("OMP_NUM_THREADS")
-    if count is not None:
-        os.environ["OMP_NUM_THREADS"] = str(count)
-    try:
-        yield
-    finally:
-        if count is not None:
-            del os.environ["OMP_NUM_THREADS"]
-            if before is not None:
-                os.environ["OMP_NUM_THREADS"] = before
 
 
 def _cause(code: int | None) -> str:

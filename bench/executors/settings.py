@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import os
 import shutil
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ..errors import UnavailableError, install_extra
 from ..machine import check_device
+from ..process import environment_variable
 from ..specs import MetricSpec
 
 ExecutorName = Literal["inline", "processes", "slurm"]
@@ -98,17 +98,11 @@ def is_speed(metric: MetricSpec) -> bool:
 
 def import_submitit() -> Any:
     """Import submitit without letting it close open log files. Raises `UnavailableError`."""
-    level = "SUBMITIT_LOG_LEVEL"
-    before = os.environ.get(level)
-    os.environ[level] = "NOCONFIG"
     try:
-        return importlib.import_module("submitit")
+        with environment_variable("SUBMITIT_LOG_LEVEL", "NOCONFIG"):
+            return importlib.import_module("submitit")
     except ImportError as error:
         raise UnavailableError("The package submitit is not installed.", install_extra("slurm")) from error
-    finally:
-        del os.environ[level]
-        if before is not None:
-            os.environ[level] = before
 
 
 def check_executor(execution: Execution, device: str) -> None:

@@ -8,7 +8,7 @@ import time
 import psutil
 import pytest
 
-from headbench.bench.process import LONGEST_LOG, ProgramError, run_program
+from headbench.bench.process import LONGEST_LOG, ProgramError, environment_variable, run_program
 
 LEAVES = """
 import subprocess, sys
@@ -82,3 +82,14 @@ def test_the_log_keeps_the_beginning_and_the_end(tmp_path):
 )
 def test_a_program_that_closes_its_output_is_waited_for(tmp_path, code, end):
     assert run(tmp_path, f"import os; {code}")[0].code == end
+
+
+@pytest.mark.parametrize("before", [None, "old"])
+@pytest.mark.parametrize("value", [None, "new"])
+def test_a_variable_is_set_within_the_block_alone(monkeypatch, before, value):
+    name = "HEADBENCH_TEST_VARIABLE"
+    if before is not None:
+        monkeypatch.setenv(name, before)
+    with environment_variable(name, value):
+        assert os.environ.get(name) == (value or before)
+    assert os.environ.get(name) == before
