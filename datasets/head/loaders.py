@@ -1,4 +1,18 @@
-"""Load a head model from a FLAME pickle, headbench's npz, or ICT-FaceKit's npz."""
+"""Load a head model from a FLAME pickle, headbench's npz, or the folder of ICT-FaceKit.
+
+Formats read:
+
+- FLAME 2020 and 2023 (`generic_model.pkl`, `flame2023.pkl`). Written by the authors of FLAME (flame.is.tue.mpg.de; licensed).
+  Not checked on a file of the program.
+- FLAME 2023 Open (`flame2023_Open.pkl`, in some archives `flame2023.pkl`). Written by the authors of FLAME (CC BY 4.0, after
+  registration). Not checked on a file of the program.
+- FLAME's masks (`FLAME_masks.pkl`). Written by the authors of FLAME (after registration). Not checked on a file of the program.
+- Texture coordinates (`head_template_mesh.obj`, `head_template.obj`). Written by the authors of FLAME. Checked on
+  ShenhanQian/VHAP@4b64ab7d `asset/flame/head_template_mesh.obj` and yfeng95/DECA@a11554ae `data/head_template.obj`, whose
+  triangles agree.
+- Eyelid bases (`l_eyelid.npy`, `r_eyelid.npy`). Written by Zielon/metrical-tracker, also in georgeretsi/smirk. Checked on
+  Zielon/metrical-tracker@c2a51722 `flame/blendshapes/l_eyelid.npy`.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +28,12 @@ import numpy as np
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
-from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy, read_npz
+from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy
 from ...bench.io.documents import read_json, read_text
 from ...bench.io.files import open_regular, reading
 from ...bench.io.unpickle import read_pickle
 from .arrays import RING_REGIONS, HeadArrays, read_head, with_derived_regions
-from .ict import ict_head, is_ict
+from .ict import ict_head, is_ict, read_ict
 
 CHART_FILES = ("head_template_mesh.obj", "head_template.obj")
 """FLAME's mesh with texture coordinates, as VHAP and GaussianAvatars, and DECA, name it."""
@@ -97,7 +111,7 @@ def load_head(
     ----------
     path : str | PathLike[str]
         FLAME pickle (2020: ``generic_model.pkl``, 2023: ``flame2023.pkl``, 2023 Open by its content),
-        npz written by `save_head`, or ICT-FaceKit npz.
+        npz written by `save_head`, or ICT-FaceKit's folder ``FaceXModel`` or an npz of its arrays.
     masks : str | PathLike[str] | None
         ``FLAME_masks.pkl``, for a FLAME pickle; the derived regions are added.
     regions : str | PathLike[str] | None
@@ -118,10 +132,12 @@ def load_head(
         A file is missing, damaged or of an unknown kind, or its arrays do not form a head.
     """
     path = Path(path)
-    with open_regular(path, "a head model file") as stream:
-        start = stream.read(len(_ZIP))
+    start = _ZIP  # also of the folder of ICT-FaceKit
+    if not path.is_dir():
+        with open_regular(path, "a head model file") as stream:
+            start = stream.read(len(_ZIP))
     if start == _ZIP:
-        content = read_npz(path)
+        content = read_ict(path)
         head = ict_head(path, content) if is_ict(content) else read_head(path)
         if version is not None and version != head.version:
             raise InputError(path, "version", repr(version), repr(head.version))

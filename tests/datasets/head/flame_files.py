@@ -106,7 +106,12 @@ def write_flame(path: Path, head: HeadArrays, *, legacy: bool = True) -> Path:
     """Write a FLAME pickle; the legacy one holds chumpy objects, the other plain arrays."""
     content = flame_content(head)
     if head.version == OPEN:  # arrays of Python 3, and one key more
-        names = {"expr_source": "SUPR_head", "supr_gender": "male", "expr_components": "last_100", "n_expr": 100}
+        names = {
+            "expr_source": "SUPR_head",
+            "supr_gender": "male",
+            "expr_components": "last_100",
+            "n_expr": 100,
+        }
         content |= {"J_regressor": head.joint_regressor, OPEN_KEY: names}
         legacy = False
     if not legacy:
