@@ -1,7 +1,9 @@
-"""Landmarks by MediaPipe's face landmark network.
+"""Landmarks by MediaPipe's face landmark network, whose file is read without the package mediapipe.
 
-The network's file is part of the package mediapipe 0.10.21 (``mediapipe/modules/face_landmark/face_landmark.tflite``) and is
-read without that package.
+Formats read:
+
+- MediaPipe's face landmark network. Written by google-ai-edge/mediapipe 0.10.21. Checked on its wheel,
+  `mediapipe/modules/face_landmark/face_landmark.tflite`, with a photograph in the public domain.
 """
 
 from __future__ import annotations

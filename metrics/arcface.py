@@ -2,6 +2,10 @@
 
 Deng, Guo, Xue, Zafeiriou, "ArcFace: Additive Angular Margin Loss for Deep Face Recognition", CVPR 2019. Crop and colours are
 those of the insightface project.
+
+Formats read:
+
+- ArcFace (`w600k_r50.onnx` of `buffalo_l.zip`). Written by deepinsight/insightface. Not checked on a file of the program.
 """
 
 from __future__ import annotations

@@ -14,6 +14,13 @@ are read without importing it. The backbone is looked for, in this order:
 4. PyTorch's published file, downloaded once into headbench's cache and checked against the hash in its name.
 
 In a folder, the published file name, or the name of a file with only the convolutional part, is looked for.
+
+Formats read:
+
+- Weights of AlexNet, SqueezeNet and VGG-16 (`alexnet-owt-7be5be79.pth` and the like). Written by pytorch/vision. Not checked on
+  a file of the program.
+- Linear layers of LPIPS 0.1. Written by richzhang/PerceptualSimilarity. Checked on the files in torchmetrics' package, with the
+  scores of the package lpips 0.1.4 for richzhang/PerceptualSimilarity@082bb24f `imgs`.
 """
 
 from __future__ import annotations

@@ -3,6 +3,10 @@
 Jin, Liao, Shao, "Pixel-in-Pixel Net: Towards Efficient Facial Landmark Detection in the Wild", International Journal of
 Computer Vision, 2021: the network with ResNet-18 (He et al., 2016), stride 32 and 10 neighbours, with the parameter names of
 the authors' file, so that it loads as it is.
+
+Formats read:
+
+- Weights of PIPNet (WFLW, ResNet-18). Written by jhb86253817/PIPNet. Not checked on a file of the program.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import pytest
 from headbench.bench import cli
 from headbench.bench.engine import run as runner
 from headbench.datasets.ga.layout import DECLARATION_FILE, HEAD_FILE
-from headbench.datasets.head.loaders import EYELID_FILES, MASKS_FILE, load_head
+from headbench.datasets.head.loaders import EYELID_FILES, MASKS_FILE, OPEN, load_head
 from headbench.datasets.head.teeth import with_teeth
 
 from .datasets.head.flame_files import write_flame
@@ -32,6 +32,14 @@ def files(tmp_path_factory):
     write_stand_in(folder / "flame")
     other = replace(stand_in("flame2023"), expression_basis=stand_in().expression_basis[:, :, ::-1].copy())
     write_flame(folder / "flame" / "flame2023.pkl", other)
+    (folder / "flame" / "open").mkdir()
+    opened = replace(
+        other,
+        version=OPEN,
+        template=other.template + 2 * other.shape_basis[:, :, 0],
+        expression_basis=other.expression_basis[:, :, ::-1].copy(),
+    )
+    write_flame(folder / "flame" / "open" / "flame2023.pkl", opened)
     (folder / "bare").mkdir()
     shutil.copy(folder / "flame" / "flame2023.pkl", folder / "bare")
     head = replace(with_teeth(load_head(folder / "flame" / "flame2023.pkl")), eyelid_basis=None)
@@ -76,6 +84,8 @@ COMMANDS = (
     "run --config config.json",
     f"prepare refit capture {GIVEN} --target flame/generic_model.pkl --out refitted",
     "prepare refit refitted/UNION3_901 --target flame/flame2023.pkl --out again",
+    f"prepare refit capture {GIVEN} --target flame/open/flame2023.pkl --out open",
+    "prepare refit open/UNION3_901 --target flame/generic_model.pkl --out closed",
     "prepare refit refitted/UNION3_901 --target 2023 --out procedural",
     f"export colmap capture {GIVEN} --out colmap --names flat --tracking",
     f"{PREPARE} --sequences EMO-1,FREE --downscale 1 --out prepared",
@@ -97,6 +107,11 @@ def test_every_command_takes_flame(files, monkeypatch, capsys):
         out = capsys.readouterr()
         assert code == 0, f"{line}\n{out.out[-2000:]}\n{out.err[-2000:]}"
         assert "UserWarning" not in out.err, line
+    assert json.loads((files / "open" / "UNION3_901" / DECLARATION_FILE).read_text())["head_model"] == OPEN
+    # The same bases in another order: exact, but for the static offset, which no basis has.
+    opened, closed = (json.loads((files / name / "refit.json").read_text()) for name in ("open", "closed"))
+    assert opened["mean_mm"] < opened["neutral_mm"] + 0.02
+    assert closed["mean_mm"] < 0.02
     assert cli.main(f"lint capture {GIVEN}".split()) in (0, 1)
     seen = capsys.readouterr().out
     assert not {"HB100", "HB602", "HB603"} & set(seen.split())  # what cannot be read

@@ -14,9 +14,11 @@ from ...bench.contracts import FloatArray, HeadPose
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npz
 from ..head.arrays import HeadArrays, check_size
-from ..head.loaders import EYELIDS_REMEDY, load_head
+from ..head.loaders import EYELIDS_REMEDY, OPEN, load_head
 from ..head.teeth import with_teeth, with_teeth_where_possible
 from .layout import DECLARATION_FILE, HEAD_FILE, Declaration
+
+log = logging.getLogger(__name__)
 
 
 def find_head(
@@ -41,6 +43,13 @@ def find_head(
     else:
         path = Path(head) if head else folder / (declaration.head_file if declaration else HEAD_FILE)
         asset = _load(path, files)
+        if asset.version == OPEN and not declaration:
+            log.warning(
+                "%s is FLAME 2023 Open. Its coefficients are not those of FLAME 2023, and %s does not say which of them "
+                "it was tracked with: `headbench prepare refit` converts a capture of FLAME 2023.",
+                path,
+                folder,
+            )
     if declaration and asset.version != declaration.head_model:
         expected = f"{asset.version}, the version of the head model given"
         remedy = "Coefficients of different head models are not interchangeable."
@@ -51,14 +60,12 @@ def find_head(
 def _load(path: Path, files: Mapping[str, Any]) -> HeadArrays:
     if not path.exists():
         remedy = (
-            "Captures of NeRSemble subjects need flame2023.pkl (FLAME 2023, versions with jaw rotation) from "
+            "Captures of NeRSemble subjects need flame2023.pkl (FLAME 2023 with jaw rotation, not FLAME 2023 Open) from "
             "https://flame.is.tue.mpg.de; give its path as head=. Synthetic captures contain theirs."
         )
         raise InputError(path, "", "the head model the capture was tracked with", "no such file", remedy)
     return load_head(path, **files)
 
-
-log = logging.getLogger(__name__)
 
 TeethPolicy = Literal["auto", "add", "keep"]
 

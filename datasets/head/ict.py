@@ -7,13 +7,20 @@ skeleton, so the skeleton is fitted here:
   share of its displacement that the hinge explains, and the rest becomes a pose corrective;
 * eyes: centres of the spheres through the back of the eyeballs;
 * neck and root: centres of the neck's cross-section half-way and at its base, blended along the neck.
+
+Formats read:
+
+- ICT-FaceKit Light (the folder `FaceXModel` of OBJ files). Written by ICT-VGL/ICT-FaceKit. Checked on
+  ICT-VGL/ICT-FaceKit@da5f95a6 `FaceXModel`, all 158 meshes.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +30,9 @@ from skimage.measure import points_in_poly
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
-from ...bench.io.arrays import MAX_MAGNITUDE, Member, check_arrays
-from ...bench.io.files import reading
+from ...bench.io.arrays import MAX_MAGNITUDE, Member, check_arrays, read_npz
+from ...bench.io.documents import read_json, read_text
+from ...bench.io.files import read_bytes, reading
 from ..rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .arrays import HeadArrays
 from .geometry import border_edges, even_weights, fit_sphere, mesh_edges, smoothstep
@@ -52,9 +60,74 @@ _KEYS = {
 }
 
 
+NEUTRAL, INDICES = "generic_neutral_mesh.obj", "vertex_indices.json"
+
+
 def is_ict(content: Mapping[str, np.ndarray]) -> bool:
     """Whether the members of an npz look like ICT-FaceKit's."""
     return {"v_neutral", "expr_deltas", "id_deltas"} <= set(content)
+
+
+def read_ict(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of the kit by name: those of an npz, or of its folder ``FaceXModel`` (or the folder above) of OBJ files.
+
+    ``v_neutral`` (V, 3) and the deltas (K, V, 3) in centimetres, ``tri_v`` (F, 3) with ``tri_material`` (F,), names, and
+    ``idx_to_landmark_verts`` (68,).
+    """
+    if not path.is_dir():
+        return read_npz(path)
+    folder = next((place for place in (path, path / "FaceXModel") if (place / NEUTRAL).is_file()), None)
+    if folder is None:
+        raise InputError(path, NEUTRAL, "the folder FaceXModel of ICT-FaceKit", "no such file")
+    neutral, triangles, materials = _mesh(folder / NEUTRAL)
+    shapes = sorted(file.stem for file in folder.glob("*.obj") if file.name != NEUTRAL)
+    deltas = {}
+    for name in shapes:
+        vertices = _vertices(folder / f"{name}.obj")
+        if vertices.shape != neutral.shape:
+            expected = f"{len(neutral)} vertices, as in {NEUTRAL}"
+            raise InputError(folder / f"{name}.obj", "v", expected, str(len(vertices)))
+        deltas[name] = vertices - neutral
+    expressions = [name for name in shapes if not name.startswith("identity")]
+    indices = read_json(folder / INDICES)
+    with reading(folder / INDICES, "lists of vertices by name"):
+        landmarks = np.array(indices["idx_to_landmark_verts"], np.int64)
+    identities = [deltas[name] for name in shapes if name.startswith("identity")]
+    return {
+        "v_neutral": neutral,
+        "tri_v": triangles,
+        "tri_material": np.array([sorted({*materials}).index(name) for name in materials]),
+        "material_names": np.array(sorted({*materials})),
+        "expr_names": np.array(expressions),
+        "expr_deltas": np.stack([deltas[name] for name in expressions])
+        if expressions
+        else np.zeros((0, 0, 3)),
+        "id_deltas": np.stack(identities) if identities else np.zeros((0, *neutral.shape)),
+        "idx_to_landmark_verts": landmarks,
+    }
+
+
+def _vertices(path: Path) -> FloatArray:
+    """(V, 3) vertices of an OBJ file."""
+    content = read_bytes(path, "an OBJ mesh")
+    with reading(path, "an OBJ mesh"):
+        rows = re.findall(rb"^v (.*)$", content, re.MULTILINE)
+        return np.fromstring(b" ".join(rows), np.float32, sep=" ").reshape(len(rows), 3)
+
+
+def _mesh(path: Path) -> tuple[FloatArray, IntArray, list[str]]:
+    """Vertices (V, 3), triangles (F, 3), quads split, and the name of each triangle's material."""
+    triangles, materials, material = [], [], ""
+    with reading(path, "an OBJ mesh with materials"):
+        for line in read_text(path, "an OBJ mesh").splitlines():
+            word, _, rest = line.partition(" ")
+            if word == "usemtl":
+                material = rest.strip()
+            elif word == "f":
+                corners = [int(corner.partition("/")[0]) - 1 for corner in rest.split()]
+                triangles += [[corners[0], *corners[k : k + 2]] for k in range(1, len(corners) - 1)]
+                materials += [material] * (len(corners) - 2)
+        return _vertices(path), np.array(triangles, np.int64).reshape(-1, 3), materials
 
 
 def expression_names(content: Mapping[str, np.ndarray]) -> tuple[str, ...]:

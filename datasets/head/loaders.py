@@ -1,9 +1,24 @@
-"""Load a head model from a FLAME pickle, headbench's npz, or ICT-FaceKit's npz."""
+"""Load a head model from a FLAME pickle, headbench's npz, or the folder of ICT-FaceKit.
+
+Formats read:
+
+- FLAME 2020 and 2023 (`generic_model.pkl`, `flame2023.pkl`). Written by the authors of FLAME (flame.is.tue.mpg.de; licensed).
+  Not checked on a file of the program.
+- FLAME 2023 Open (`flame2023_Open.pkl`, in some archives `flame2023.pkl`). Written by the authors of FLAME (CC BY 4.0, after
+  registration). Not checked on a file of the program.
+- FLAME's masks (`FLAME_masks.pkl`). Written by the authors of FLAME (after registration). Not checked on a file of the program.
+- Texture coordinates (`head_template_mesh.obj`, `head_template.obj`). Written by the authors of FLAME. Checked on
+  ShenhanQian/VHAP@4b64ab7d `asset/flame/head_template_mesh.obj` and yfeng95/DECA@a11554ae `data/head_template.obj`, whose
+  triangles agree.
+- Eyelid bases (`l_eyelid.npy`, `r_eyelid.npy`). Written by Zielon/metrical-tracker, also in georgeretsi/smirk. Checked on
+  Zielon/metrical-tracker@c2a51722 `flame/blendshapes/l_eyelid.npy`.
+"""
 
 from __future__ import annotations
 
 import re
 import reprlib
+from collections.abc import Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -13,12 +28,12 @@ import numpy as np
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
-from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy, read_npz
+from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy
 from ...bench.io.documents import read_json, read_text
 from ...bench.io.files import open_regular, reading
 from ...bench.io.unpickle import read_pickle
 from .arrays import RING_REGIONS, HeadArrays, read_head, with_derived_regions
-from .ict import ict_head, is_ict
+from .ict import ict_head, is_ict, read_ict
 
 CHART_FILES = ("head_template_mesh.obj", "head_template.obj")
 """FLAME's mesh with texture coordinates, as VHAP and GaussianAvatars, and DECA, name it."""
@@ -95,8 +110,8 @@ def load_head(
     Parameters
     ----------
     path : str | PathLike[str]
-        FLAME pickle (2020: ``generic_model.pkl``, 2023: ``flame2023.pkl``), npz written by
-        `save_head`, or ICT-FaceKit npz.
+        FLAME pickle (2020: ``generic_model.pkl``, 2023: ``flame2023.pkl``, 2023 Open by its content),
+        npz written by `save_head`, or ICT-FaceKit's folder ``FaceXModel`` or an npz of its arrays.
     masks : str | PathLike[str] | None
         ``FLAME_masks.pkl``, for a FLAME pickle; the derived regions are added.
     regions : str | PathLike[str] | None
@@ -108,7 +123,8 @@ def load_head(
         OBJ file of the mesh with texture coordinates.
     version : str | None
         Name of the expression basis. Required if the file name of a FLAME pickle does not contain it
-        ("flame2020", "flame2023"); must agree with the version in an npz of this package.
+        ("flame2020", "flame2023"); must agree with the version in an npz of this package, and with the content of
+        FLAME 2023 Open ("flame2023_open").
 
     Raises
     ------
@@ -116,10 +132,12 @@ def load_head(
         A file is missing, damaged or of an unknown kind, or its arrays do not form a head.
     """
     path = Path(path)
-    with open_regular(path, "a head model file") as stream:
-        start = stream.read(len(_ZIP))
+    start = _ZIP  # also of the folder of ICT-FaceKit
+    if not path.is_dir():
+        with open_regular(path, "a head model file") as stream:
+            start = stream.read(len(_ZIP))
     if start == _ZIP:
-        content = read_npz(path)
+        content = read_ict(path)
         head = ict_head(path, content) if is_ict(content) else read_head(path)
         if version is not None and version != head.version:
             raise InputError(path, "version", repr(version), repr(head.version))
@@ -131,7 +149,7 @@ def load_head(
             path, "", expected, f"a file that starts with {start!r}" if start else "an empty file"
         )
     else:
-        head = _flame(path, version or flame_version(path))
+        head = _flame(path, version)
         masks = masks or _beside(path, MASKS_FILE)
         own = path.with_name(REGIONS_FILE)  # a common file name
         regions = regions or (own if own.is_file() else None)
@@ -177,14 +195,18 @@ def _with_eyelids(head: HeadArrays, folder: Path, file: Path) -> HeadArrays:
     return replace(head, eyelid_basis=np.stack(bases, axis=2)).validate(folder)
 
 
+OPEN, OPEN_KEY = "flame2023_open", "supr_expression_metadata"
+"""FLAME 2023 Open (CC BY 4.0) and the key that its pickle alone has. Its template, identities and expressions, which are
+SUPR's, differ from those of FLAME 2023, although its archive calls the file ``flame2023.pkl``, too."""
+
+
 def flame_version(path: Path) -> str:
     """Version of a FLAME pickle by its usual file or folder name, such as ``FLAME2020/male_model.pkl``.
 
     Raises
     ------
     InputError
-        The name is ambiguous. The two files have the same layout, so confusing them would go
-        unnoticed.
+        The name is ambiguous. The files have the same layout, so confusing them would go unnoticed.
     """
     stem = path.stem.lower().replace("-", "_")
     folder = re.fullmatch("flame[-_ ]?(2020|2023)", path.parent.name.lower())
@@ -194,13 +216,23 @@ def flame_version(path: Path) -> str:
     if folder and (not years or stem == "generic_model"):
         years.add(folder[1])
     if years == {"2023"}:
-        return "flame2023_no_jaw" if "no_jaw" in stem else "flame2023"
+        return "flame2023_no_jaw" if "no_jaw" in stem else OPEN if "open" in stem else "flame2023"
     if years == {"2020"}:
         return "flame2020"
     expected = "a name with FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)"
     found = path.name if not folder else f"{path.parent.name}/{path.name}"
     remedy = "Rename the file, or set version='flame2020' or 'flame2023' in Python. Their coefficients are not interchangeable."
     raise InputError(path, "version", expected, repr(found), remedy)
+
+
+def _content_version(path: Path, content: Mapping[str, Any], stated: str | None) -> str:
+    """Version of a FLAME pickle by its content, else as stated, else by its name."""
+    if OPEN_KEY not in content:
+        return stated or flame_version(path)
+    if stated not in (None, OPEN):
+        remedy = f"The key {OPEN_KEY} is that of FLAME 2023 Open, whose coefficients are not interchangeable with theirs."
+        raise InputError(path, "version", repr(stated), repr(OPEN), remedy)
+    return OPEN
 
 
 def read_masks(path: str | PathLike[str]) -> dict[str, IntArray]:
@@ -225,8 +257,9 @@ def _members(path: str | PathLike[str], name: str, members: Any) -> IntArray:
     return members if name in RING_REGIONS else np.unique(members)
 
 
-def _flame(path: Path, version: str) -> HeadArrays:
+def _flame(path: Path, stated: str | None) -> HeadArrays:
     content = read_pickle(path)
+    version = _content_version(path, content, stated)
 
     def array(name: str, kinds: str, ndim: int) -> np.ndarray:
         values = content.get(name)

@@ -13,7 +13,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import digest
 from ..ga import layout
 from ..head.arrays import HeadArrays
-from ..head.loaders import load_head
+from ..head.loaders import OPEN, load_head
 from ..head.procedural.versions import VERSIONS
 from .names import (
     PAPER_SEQUENCES,
@@ -36,7 +36,7 @@ IMAGES_VERSION = 1
 """Increased when the same recording and settings give other images than before."""
 
 _USUAL_HEAD = "flame2023"
-_FLAME_VERSIONS = ("flame2020", _USUAL_HEAD, "flame2023_no_jaw")
+_FLAME_VERSIONS = ("flame2020", _USUAL_HEAD, "flame2023_no_jaw", OPEN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +174,9 @@ def _head_version(settings: PrepareSettings, head: HeadArrays | None) -> str:
         if stated not in ("", head.version):
             expected = f"{head.version!r}, the version of {settings.head}"
             raise InputError("command line", "--head-model", expected, repr(stated), "Leave it out.")
+        if head.version == OPEN != stated:  # the published tracking is that of FLAME 2023
+            remedy = f"{settings.head} is FLAME 2023 Open: say so if the tracking was made with it, else give FLAME 2023."
+            raise InputError("command line", "--head-model", repr(OPEN), "nothing", remedy)
         return head.version
     known = (*_FLAME_VERSIONS, *VERSIONS)
     if stated and stated not in known:

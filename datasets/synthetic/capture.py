@@ -102,7 +102,7 @@ def synthesize(
     size : tuple[int, int]
         (width, height) of the images, pixels.
     head : str
-        "procedural", or the file of a head model (npz of ICT-FaceKit).
+        "procedural", or the path of a head model (ICT-FaceKit).
     seed : int
         Seed of the heads and their performances.
     tracking_noise : float

@@ -38,7 +38,7 @@ class SynthSettings(ExecutionOptions):
     size: str = "275x401"
     """Width x height of the images in pixels, for example 550x802 (NeRSemble at a quarter)."""
     head: str = "procedural"
-    """`procedural`, or the path of a head model (ICT-FaceKit npz)."""
+    """`procedural`, or the path of a head model (the folder `FaceXModel` of ICT-FaceKit)."""
     seed: int = 0
     """Seed of subjects and performances."""
     tracking_noise: float = 0.0

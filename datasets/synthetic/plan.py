@@ -13,12 +13,11 @@ import torch
 
 from ...bench.contracts import Camera, FloatArray, HeadPose
 from ...bench.errors import InputError
-from ...bench.io.arrays import read_npz
 from ...bench.io.files import digest
 from ..ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from ..head.arrays import HeadArrays
 from ..head.geometry import smoothstep
-from ..head.ict import expression_names, ict_head, is_ict
+from ..head.ict import expression_names, ict_head, is_ict, read_ict
 from ..head.model import HeadModel
 from ..head.procedural.model import procedural_head
 from ..rounding import ANGLE_BITS, COEFFICIENT_BITS, LENGTH_BITS, on_grid
@@ -324,15 +323,15 @@ class Geometry:
 
 
 def load_geometry(name: str) -> Geometry:
-    """``procedural`` (or ``procedural2020``, ``procedural2023``), or the path of an ICT-FaceKit npz."""
+    """``procedural`` (or ``procedural2020``, ``procedural2023``), or the folder ``FaceXModel`` of ICT-FaceKit or an npz of its arrays."""
     if name in PROCEDURAL:
         return _procedural(name.removeprefix("procedural") or "2023")
     path = Path(name)
-    if not path.is_file():
-        raise InputError("--head", "", f"{', '.join(PROCEDURAL)} or an existing file", name)
-    content = read_npz(path)
+    if not path.exists():
+        raise InputError("--head", "", f"{', '.join(PROCEDURAL)} or an existing file or folder", name)
+    content = read_ict(path)
     if not is_ict(content):
-        expected = "an ICT-FaceKit npz"
+        expected = "ICT-FaceKit, its folder FaceXModel or an npz"
         raise InputError(path, "", expected, f"{', '.join(sorted(content))}", "Or take the procedural head.")
     head = ict_head(path, content)
     translation = named_translation(head, expression_names(content), ICT_TARGETS)

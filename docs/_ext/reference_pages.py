@@ -19,7 +19,7 @@ import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from docutils import nodes
 
@@ -469,6 +469,52 @@ def readers_page() -> str:
     return "\n".join(lines)
 
 
+class Format(NamedTuple):
+    """A format of other programs, as the docstring of the module that reads it states under "Formats read:"."""
+
+    module: str
+    name: str
+    writer: str
+    checked: str
+    """A public file of the program on which the reader was checked; "" if there was none."""
+
+
+def formats() -> list[Format]:
+    """Formats of other programs, by module. Raises `ValueError` for an entry that does not state writer and check."""
+    found = []
+    root = Path(headbench.bench.__path__[0]).parent
+    for path in sorted(path for package in PACKAGES for path in (root / package).rglob("*.py")):
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        _, heading, entries = text.partition("\nFormats read:\n")
+        for entry in re.findall(r"^- .*(?:\n  .*)*", entries if heading else "", re.MULTILINE):
+            match = FORMAT.fullmatch(" ".join(entry.split()))
+            if not match:
+                raise ValueError(
+                    f"{path}: expected `- NAME. Written by WHO. Checked on WHAT.`, found {entry!r}"
+                )
+            found.append(Format(path.relative_to(root).as_posix(), match[1], match[2], match[3] or ""))
+    return found
+
+
+PACKAGES = ("bench", "datasets", "methods", "metrics", "reports")
+FORMAT = re.compile(
+    r"- (.+?)\. Written by (.+?)\. (?:Checked on (.+)|Not checked on a file of the program)\."
+)
+
+
+def formats_page() -> str:
+    """Formats of other programs, and the public file on which each reader was checked."""
+    known = formats()
+    rows = ([one.name, one.writer, one.checked or "**not checked**", f"`{one.module}`"] for one in known)
+    return (
+        "# Formats of other programs\n\n"
+        f"{sum(bool(one.checked) for one in known)} of {len(known)} formats were checked on a file that the program wrote: it was read, "
+        "and units, signs, order and rate of the values were compared with the code of the program. The others were written from the "
+        "code or the description of the program, as no file of it was public; a report with such a file is welcome.\n\n"
+        + table(("format", "written by", "checked on", "reader"), rows)
+    )
+
+
 # Lists -----------------------------------------------------------------------------------------------------------------
 
 
@@ -693,6 +739,7 @@ def pages() -> dict[str, str]:
         **api_pages(),
         "run-settings": run_settings_page(),
         "readers": readers_page(),
+        "formats": formats_page(),
         "lint": lint_page(),
         "metrics": metrics_page(),
         "conditions": conditions_page(),

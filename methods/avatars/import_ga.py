@@ -1,4 +1,10 @@
-"""GaussianAvatars' PLY files as avatars."""
+"""GaussianAvatars' PLY files as avatars.
+
+Formats read:
+
+- GaussianAvatars' avatars (`point_cloud.ply` with `flame_param.npz`). Written by ShenhanQian/GaussianAvatars. Checked on
+  files that ShenhanQian/GaussianAvatars@30cc4bde wrote when it was trained on a synthetic capture.
+"""
 
 from __future__ import annotations
 

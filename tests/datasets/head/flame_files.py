@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse
 
 from headbench.datasets.head.arrays import HeadArrays
+from headbench.datasets.head.loaders import OPEN, OPEN_KEY
 
 
 class _Ch:
@@ -104,6 +105,15 @@ def flame_content(head: HeadArrays) -> dict[str, Any]:
 def write_flame(path: Path, head: HeadArrays, *, legacy: bool = True) -> Path:
     """Write a FLAME pickle; the legacy one holds chumpy objects, the other plain arrays."""
     content = flame_content(head)
+    if head.version == OPEN:  # arrays of Python 3, and one key more
+        names = {
+            "expr_source": "SUPR_head",
+            "supr_gender": "male",
+            "expr_components": "last_100",
+            "n_expr": 100,
+        }
+        content |= {"J_regressor": head.joint_regressor, OPEN_KEY: names}
+        legacy = False
     if not legacy:
         path.write_bytes(pickle.dumps(content, protocol=4))
         return path

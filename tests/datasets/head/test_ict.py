@@ -17,6 +17,7 @@ from headbench.datasets.head.ict import (
     hinge_correctives,
     hinge_weights,
     ict_head,
+    read_ict,
 )
 from headbench.datasets.head.loaders import load_head
 from headbench.datasets.head.model import HeadModel
@@ -147,6 +148,56 @@ def test_refuses_other_content(content, key):
     assert caught.value.file == "kit.npz"
     if key != "v_neutral":  # there it is the first array that disagrees
         assert caught.value.key == key
+
+
+NEUTRAL = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0.5]], np.float32)
+FACES = "usemtl M_Face\nf 1/1 2/2 3/3 4/4\nusemtl M_Back\nf 2/1/1 5/2/1 3/3/1\n"
+
+
+def write_kit(folder, **moved):
+    """A folder as the kit's: meshes with quads and materials, whose shapes move one vertex, and the list of landmarks."""
+    folder.mkdir(parents=True)
+    for name, vertex in {"generic_neutral_mesh": None, **moved}.items():
+        vertices = NEUTRAL + 0.25 * (np.arange(5) == vertex)[:, None]
+        rows = "".join(f"v {x:g} {y:g} {z:g}\n" for x, y, z in vertices) + "vt 0 0\nvn 0 0 1\n"
+        (folder / f"{name}.obj").write_text(f"# kit\nmtllib kit.mtl\n{rows}{FACES}")
+    (folder / "vertex_indices.json").write_text('{"idx_to_landmark_verts": [4, 0]}')
+    return folder
+
+
+def test_the_folder_of_the_kit_is_read(tmp_path):
+    folder = write_kit(tmp_path / "kit" / "FaceXModel", jawOpen=4, browDown_L=1, identity000=2)
+    for path in (folder, folder.parent):
+        content = read_ict(path)
+        np.testing.assert_array_equal(content["v_neutral"], NEUTRAL)
+        np.testing.assert_array_equal(content["tri_v"], [[0, 1, 2], [0, 2, 3], [1, 4, 2]])
+        assert content["material_names"][content["tri_material"]].tolist() == ["M_Face", "M_Face", "M_Back"]
+        assert content["expr_names"].tolist() == ["browDown_L", "jawOpen"]
+        for deltas, vertex in zip([*content["expr_deltas"], *content["id_deltas"]], (1, 4, 2)):
+            np.testing.assert_array_equal(deltas, 0.25 * (np.arange(5) == vertex)[:, None] * np.ones(3))
+        assert content["idx_to_landmark_verts"].tolist() == [4, 0]
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "said"),
+    [
+        ("jawOpen.obj", lambda text: text.replace("v 0 0 0\n", ""), "5 vertices, as in generic_neutral_mesh"),
+        ("jawOpen.obj", lambda text: text.replace("v 0 0 0", "v 0 zero 0"), "an OBJ mesh"),
+        ("generic_neutral_mesh.obj", lambda text: text.replace("f 1/1", "f one/1"), "an OBJ mesh"),
+        ("vertex_indices.json", lambda text: "{}", "lists of vertices by name"),
+    ],
+)
+def test_damaged_files_of_the_kit_are_named(tmp_path, file, change, said):
+    path = write_kit(tmp_path / "kit", jawOpen=4, identity000=2) / file
+    path.write_text(change(path.read_text()))
+    with pytest.raises(InputError, match=said) as caught:
+        load_head(tmp_path / "kit")
+    assert caught.value.file == str(path)
+
+
+def test_another_folder_is_no_kit(tmp_path):
+    with pytest.raises(InputError, match="the folder FaceXModel of ICT-FaceKit"):
+        load_head(tmp_path)
 
 
 RNG = np.random.default_rng(0)

@@ -106,6 +106,7 @@ def test_flame_pickle(tmp_path, legacy):
     [
         *(("generic_model.pkl", "flame2020"), ("FLAME2020.pkl", "flame2020"), ("flame2023.pkl", "flame2023")),
         *(("FLAME-2023.pkl", "flame2023"), ("flame2023_no_jaw.pkl", "flame2023_no_jaw")),
+        ("flame2023_Open.pkl", "flame2023_open"),
         *(("FLAME2020/male_model.pkl", "flame2020"), ("flame_2023/model.pkl", "flame2023")),
         *(
             ("FLAME2020/generic_model.pkl", "flame2020"),
@@ -131,6 +132,20 @@ def test_version_is_asked_for_where_the_name_is_silent(tmp_path):
         load_head(path)
     assert caught.value.key == "version"
     assert load_head(path, version="flame2023").version == "flame2023"
+
+
+@pytest.mark.parametrize(
+    "name", ["flame2023_Open.pkl", "flame2023.pkl", "FLAME2020/generic_model.pkl", "model.pkl"]
+)
+def test_flame_2023_open_is_known_by_its_content(tmp_path, name):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    head = replace(FLAME, version="flame2023_open")
+    assert load_head(write_flame(path, head)).version == "flame2023_open"
+    stated = load_head(path, version="flame2023_open")
+    np.testing.assert_array_equal(stated.expression_basis, head.expression_basis)
+    with pytest.raises(InputError, match="'flame2023', found 'flame2023_open'"):
+        load_head(path, version="flame2023")
 
 
 def test_masks_and_regions(tmp_path):

@@ -70,11 +70,15 @@ def test_unknown_head_models_are_refused(recording, tmp_path):
     def declared(**changes):
         return plan_subject(recording.settings(tmp_path / "out", **changes), SUBJECT).head_model
 
-    for name in ("flame2020", "flame2023", "procedural2023"):
+    for name in ("flame2020", "flame2023", "flame2023_open", "procedural2023"):
         assert declared(head="", head_model=name) == name
     assert declared(head="") == "flame2023"
     save_head(recording.head, replace(read_head(recording.head), version="mine"))
     assert declared() == declared(head_model="mine") == "mine"
+    save_head(recording.head, replace(read_head(recording.head), version="flame2023_open"))
+    assert declared(head_model="flame2023_open") == "flame2023_open"
+    with pytest.raises(InputError, match="say so if the tracking was made with it"):
+        declared()
     for wrong in ({"head": "", "head_model": "flame2032"}, {"head_model": "flame2020"}):
         with pytest.raises(InputError, match=wrong["head_model"]) as error:
             declared(**wrong)
