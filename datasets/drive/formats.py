@@ -1,4 +1,17 @@
-"""Formats of driving signals: how each is recognised and read, with mapped columns and coefficients of a head model."""
+"""Formats of driving signals: how each is recognised and read, with mapped columns and coefficients of a head model.
+
+Formats read:
+
+- EMOCA folders. Written by radekd91/emoca 2.0 (`gdl_apps/EMOCA/utils/io.py`). Not checked on a file of the program.
+- INFERNO folders. Written by radekd91/inferno (`inferno_apps/FaceReconstruction/utils/output.py`). Not checked on a file of
+  the program.
+- DECA coefficients. Written by users from the result of yfeng95/DECA (`decalib/deca.py`, `encode`) or filby89/spectre
+  (`src/spectre.py`, `encode`). Not checked on a file of the program.
+- SMIRK coefficients. Written by users from the result of georgeretsi/smirk (`src/smirk_encoder.py`). Not checked on a file of
+  the program.
+- SHeaP coefficients. Written by users from the result of nlml/sheap. Not checked on a file of the program.
+- VHAP parameters. Written by ShenhanQian/VHAP (`vhap/export_as_nerf_dataset.py`). Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 
@@ -88,7 +101,7 @@ def read_capture_signal(request: SignalRequest) -> DrivingSignal:
 
 
 DEFAULT_HEAD = "flame2020"
-"""Head model of all four."""
+"""Head model of all five."""
 
 
 def is_coefficients(table: SignalTable) -> bool:
@@ -233,9 +246,14 @@ FORMATS = (
         read_flame_parameters,
     ),
     SignalFormat(
-        "coefficients", "FLAME coefficients of DECA, EMOCA, SMIRK, SHeaP", is_coefficients, read_coefficients
+        "coefficients",
+        "FLAME coefficients of DECA, EMOCA, INFERNO, SMIRK, SHeaP",
+        is_coefficients,
+        read_coefficients,
     ),
-    SignalFormat("blendshapes", "52 blendshapes of ARKit or MediaPipe", is_blendshapes, read_blendshapes),
+    SignalFormat(
+        "blendshapes", "52 blendshapes of ARKit, MediaPipe, Audio2Face", is_blendshapes, read_blendshapes
+    ),
     SignalFormat(
         "capture", "a capture in a layout that a reader knows", lambda table: False, read_capture_signal
     ),

@@ -20,6 +20,7 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy, read_npz
 from ...bench.io.documents import parse_json, read_json, read_text, shown
 from ...bench.io.files import reading, user_files
+from ..foreign import describe
 from .names import IDENTITY, NAMES
 from .timing import Timing, from_columns, in_order
 
@@ -29,8 +30,6 @@ _CATEGORIES = "categories"
 """Key of the list of a face's categories, in all but Python."""
 _FACES = ("faceblendshapes", "face_blendshapes", "blendshapes")
 """Keys, in lower case, of the faces of a frame; empty in a frame without one."""
-_LANDMARKER = "landmarker"
-"""Part of the key of a whole result, in lower case, in messages that wrap one."""
 _COUNT, _SUCCESS = "blendshapecount", "success"
 """Columns that are 0 in a row without a face, in lower case: of Live Link Face, whose row ends there, and of OpenFace."""
 
@@ -154,8 +153,7 @@ def read_table(path: Path) -> SignalTable:
     read = _folder if path.is_dir() else _READERS.get(path.suffix.lower())
     if read is None:
         expected = f"a file in {', '.join(_READERS)}, or a folder"
-        remedy = "" if path.exists() else "There is no such file."
-        raise InputError(path, "", expected, repr(path.suffix), remedy)
+        raise InputError(path, "", expected, *describe(path))
     table = read(path)
     if not len(table) or not table.columns:
         raise InputError(path, "", "at least one frame with values", "none")
@@ -169,7 +167,7 @@ def parse_line(text: str, path: Path, place: str) -> dict[str, Any]:
 
 
 def _expanded(frame: Mapping[str, Any], path: Path, place: str, names: Sequence[str] = ()) -> dict[str, Any]:
-    """Columns of a frame, with one for each of MediaPipe's categories, or for each of ``names`` of a list of weights.
+    """Columns of a frame, also of objects in it, with one for each of MediaPipe's categories or of the ``names`` of weights.
 
     Raises `InputError` for two faces.
     """
@@ -179,7 +177,7 @@ def _expanded(frame: Mapping[str, Any], path: Path, place: str, names: Sequence[
         if faces and isinstance(faces[0], dict) and not isinstance(faces[0].get(_CATEGORIES), list):
             faces = [faces]  # the categories of one face
         scores = [_categories(face) for face in faces]
-        if isinstance(value, dict) and _LANDMARKER in name.lower():
+        if isinstance(value, dict) and scores[0] is None:
             line |= _expanded(value, path, place)
         elif name in _WEIGHTS and names and isinstance(value, list) and len(value) == len(names):
             line |= zip(names, value)
@@ -217,6 +215,7 @@ def _csv(path: Path) -> SignalTable:
     if not rows:
         raise InputError(path, "", "a header and a line for each frame", "an empty file")
     names = [name.strip() for name in rows[0][1]]
+    names[0] = names[0] or "index"  # of pandas
     for name in names:
         if not name or names.count(name) > 1:
             raise InputError(path, "header", "distinct names of columns", repr(name))
@@ -325,7 +324,8 @@ def _folder(path: Path) -> SignalTable:
             ordered, timing = in_order(found)
             table = _joined(path, [place.name for place in ordered], [read(place) for place in ordered])
             return replace(table, timing=timing)
-    raise InputError(path, "", "files npz, npy or json of a signal's frames, or a capture", "none")
+    expected = "files npz, npy or json of a signal's frames, or a capture"
+    raise InputError(path, "", expected, *describe(path))
 
 
 _READERS: Mapping[str, Callable[[Path], SignalTable]] = {

@@ -26,7 +26,7 @@ GAP = 1.5
 DAY = 86400.0
 
 _TIME = re.compile(
-    r"(time|timecode|timestamp)([ _(]*(in)?[ _(]*(n|u|m|milli|micro)?s(ec(onds)?)?\)?)?", re.IGNORECASE
+    r"time[ _]?(code|stamp)?([ _(]*(in)?[ _(]*(n|u|m|milli|micro)?s(ec(onds)?)?\)?)?", re.IGNORECASE
 )
 _NUMBER = re.compile(r"frame[ _]?(number|num|no|nr|id|idx|index)?", re.IGNORECASE)
 _TIMECODE = re.compile(r"(\d+):(\d\d):(\d\d)[:;](\d+(?:\.\d+)?)")
@@ -75,12 +75,11 @@ class Timing:
         near = [rate for fps in found for rate in RATES if abs(fps - rate) <= NEAR * rate]
         fps = float((near or found[1:])[0])
         positions = (seconds - seconds[0]) * fps
-        last = float(positions[-1])
         if (
-            steps.min() * fps < 0.5 and abs(last - len(steps)) < 0.5
-        ):  # times are rounded, and no frame is missing
-            positions = np.arange(len(seconds)) * (last / len(steps))
-        return cls(positions, last, fps, column)
+            steps.min() * fps < 0.5 and abs(positions[-1] - len(steps)) < 0.5
+        ):  # rounded times, no frame missing
+            positions = np.arange(len(seconds), dtype=np.float64)
+        return cls(positions, float(positions[-1]), fps, column)
 
     def where(self, rows: Sequence[bool]) -> Timing:
         """The frames of a mask (T,)."""
@@ -110,10 +109,8 @@ def in_order(paths: Sequence[Path]) -> tuple[list[Path], Timing]:
     doubled = {number: found for number, found in by_number.items() if len(found) > 1}
     if doubled:
         names = " and ".join(path.name for path in next(iter(doubled.values())))
-        frames = ", ".join(map(str, doubled))
-        raise InputError(
-            paths[0].parent, "", "one face a frame", f"{names}; so too frames {frames}", ONE_FACE
-        )
+        found = f"{names}; more than one of frames {', '.join(map(str, doubled))}"
+        raise InputError(paths[0].parent, "", "one file or folder a frame", found, ONE_FACE)
     return [by_number[number][0] for number in sorted(by_number)], Timing.of_numbers(sorted(by_number))
 
 

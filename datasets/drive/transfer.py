@@ -26,6 +26,8 @@ from .timing import GAP, Timing
 
 SMOOTHED = ("expression", "jaw", "eyes", "eyelids", "neck", "rotation", "translation")
 KEEP_NECK = RefitSettings(neck="keep")
+ROUNDED = 0.1
+"""Frames by which the time of the last frame may be too early."""
 ORDER = 2
 """Order of the polynomials of the Savitzky-Golay filter."""
 
@@ -175,7 +177,7 @@ def resampled(
         )
         raise InputError(path, timing.column, expected, found, "Keep a part of the signal without long gaps.")
     step = (timing.fps or fps) / fps
-    times = step * np.arange(int(timing.last / step + 1e-6) + 1)
+    times = step * np.arange(int(timing.last / step + ROUNDED) + 1)
     after = np.searchsorted(positions, times).clip(1, max(1, len(positions) - 1)) % len(positions)
     before = np.maximum(after - 1, 0)
     nearest = np.minimum(abs(times - positions[before]), abs(times - positions[after]))

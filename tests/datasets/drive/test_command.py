@@ -184,7 +184,11 @@ REFUSED = {
     "not finite": (lambda: csv("jawOpen\nnan\n"), (), "finite numbers"),
     "a short line": (lambda: csv("jawOpen,jawLeft\n1\n"), (), "line 2: expected 2 values"),
     "percent": (lambda: csv("jawOpen\n87\n"), (), "from -2 to 2, found 87"),
-    "json lines that differ": (lambda: lines('{"jawOpen": 1}\n{"jawLeft": 1}\n'), (), "jawOpen, line 2: expected a"),
+    "json lines that differ": (
+        lambda: lines('{"jawOpen": 1}\n{"jawLeft": 1}\n'),
+        (),
+        "jawOpen, line 2: expected a",
+    ),
     "damaged json": (lambda: lines('{"jawOpen": 1}\n{"jawO'), (), "line 2: expected valid JSON"),
     "null": (lambda: lines('{"jawOpen": null}\n'), (), "jawOpen, line 1"),
     "unequal lengths": (lambda: npz(expression=ONE, jaw=np.zeros((4, 3))), (), "jaw: expected 9 frames"),
