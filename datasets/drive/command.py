@@ -399,15 +399,13 @@ def report_text(data: dict[str, Any]) -> str:
     source, target = data["head_models"]
     jitter, spill, lips = data["jitter_mm"], data["spill_mm"], data["lips_mm"]
     residual, stated, filled = data["refit_residual_mm"], data["signal_fps"], data["interpolated"]
-    rate = (
-        "of the result; the signal states none"
-        if stated is None
-        else f"of the result, {stated:g} of the signal"
-    )
+    rate = f"{data['fps']:g} frames a second"
+    if stated != data["fps"]:
+        rate += ", as the signal states none" if stated is None else f", resampled from {stated:g}"
     fitted = "coefficients as they are" if residual is None else f"refit, {residual:.3f} mm on the face"
     lines = [
         f"{data['written']}: {data['frames']} frames of {data['signal']} ({data['format']})",
-        f"  frames a second {data['fps']:g} {rate}",
+        f"  rate            {rate}",
         f"  head models     {source} to {target}: {fitted}",
         "  jitter          "
         + (
@@ -427,7 +425,8 @@ def report_text(data: dict[str, Any]) -> str:
     if filled:
         count = sum(last - first + 1 for first, last in filled)
         shown = ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last in filled)
-        lines.insert(2, f"  interpolated    {count} frames without a face or missing in the signal: {shown}")
+        what = f"{count} of {data['frames']} frames, without a face or missing in the signal"
+        lines.insert(2, f"  interpolated    {what}: {shown}")
     reasons: dict[str, list[str]] = {}
     for channel, reason in data["unused"].items():
         reasons.setdefault(reason, []).append(channel)

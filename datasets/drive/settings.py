@@ -21,7 +21,7 @@ class DriveSettings(CaptureOptions):
     avatar: AvatarFolder
 
     signal: str
-    """File or folder of the signal: FLAME coefficients (npz, JSON), 52 blendshapes (CSV, JSON lines), a folder of FLAME
+    """File or folder of the signal: FLAME coefficients (npz, JSON), 52 blendshapes (CSV, JSON), a folder of FLAME
     parameters, a capture, or any table with --map."""
 
     out: str
