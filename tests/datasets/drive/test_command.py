@@ -172,6 +172,13 @@ def arrays():
     return "arrays"
 
 
+def tracked():
+    """A folder of Metrical Tracker, which has a file for each frame."""
+    Path("tracked/checkpoint").mkdir(parents=True)
+    Path("tracked/checkpoint/00000.frame").touch()
+    return "tracked"
+
+
 REFUSED = {
     "no file": (lambda: "none.csv", (), "no such file"),
     "empty csv": (lambda: csv(""), (), "empty file"),
@@ -226,6 +233,8 @@ REFUSED = {
     "a short window": (lambda: "signal.npz", ("--smooth", "0.04"), "--smooth"),
     "a long window": (lambda: "signal.npz", ("--smooth", "5"), "--smooth"),
     "sequence of no capture": (lambda: "signal.npz", ("--sequence", "FREE"), "a signal that is a capture"),
+    "a video": (lambda: (Path("a.mp4").write_text("x"), "a.mp4")[1], (), "found a video"),
+    "frames of Metrical Tracker": (tracked, (), "headbench import tracking"),
     "an empty folder": (lambda: (Path("empty").mkdir(), "empty")[1], (), "files npz, npy or json"),
 }
 
