@@ -172,7 +172,7 @@ def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
     """
     if unit_range(evidence) or limited_range(evidence):
         return
-    seen = outside_colours(evidence)
+    seen = [found for found in outside_colours(evidence) if not _shows_room(found[0])]
     wrong = [(view, colour) for view, colour, _ in seen if _foreign(evidence, colour)]
     if wrong:
         found = np.median([colour for _, colour in wrong], axis=0).round().astype(int)
@@ -183,6 +183,26 @@ def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
             f"declared background is level {tuple(stated.tolist())}, outside the subject there is {shown} in "
             f"{len(wrong)} of {counted(len(seen), 'frame')} checked",
             wrong[0][0].entry.image,
+        )
+
+
+def _shows_room(view: ViewFacts) -> bool:
+    """Whether a frame without a mask shows something behind the subject."""
+    return view.mask is None and view.room
+
+
+@rule("HB309", "warning")
+def _room(evidence: Evidence) -> Iterator[Hit]:
+    """The room is seen behind the subject.
+
+    Make masks, unless the room is to count in every metric: avatars have no room.
+    """
+    seen = outside_colours(evidence)
+    rooms = [view for view, colour, _ in seen if _shows_room(view) and _foreign(evidence, colour)]
+    if rooms:
+        yield Hit(
+            f"{len(rooms)} of {counted(len(seen), 'frame')} checked have no mask and no background of one colour",
+            rooms[0].entry.image,
         )
 
 
