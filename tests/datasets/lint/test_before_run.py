@@ -1,6 +1,5 @@
 """What a run looks for before it trains: every error of the linter, unless the reader refuses the capture."""
 
-
 import pytest
 
 from headbench.bench.errors import InputError
