@@ -29,6 +29,9 @@ FRINGES = (0.65, 1.5)
 
 BLANK_COVERAGE = 0.001
 
+MASK_LEVELS = (12, 240)
+"""Maximum level of what is outside a mask, and minimum level of what is inside."""
+
 LIMITED_LOW, LIMITED_HIGH = (14, 24), (231, 237)
 """Expected range of the minimum and maximum level of limited-range images; resizing softens the ends a
 little."""
@@ -45,12 +48,13 @@ def _masks(evidence: Evidence) -> list[tuple[ViewFacts, MaskFacts]]:
     return [(v, v.mask) for v in evidence.views if v.mask is not None and v.entry.camera_id not in blank]
 
 
-def _unit_mask(mask: MaskFacts) -> bool:
-    return mask.high == 1
+def _other_levels(mask: MaskFacts) -> bool:
+    """Whether nothing is covered fully, or everything a little."""
+    return 0 < mask.high < MASK_LEVELS[1] or MASK_LEVELS[0] < mask.low <= 127
 
 
 def _empty(mask: MaskFacts) -> bool:
-    return mask.coverage < BLANK_COVERAGE and not _unit_mask(mask)
+    return mask.coverage < BLANK_COVERAGE and not _other_levels(mask)
 
 
 def _full(mask: MaskFacts) -> bool:
@@ -62,7 +66,7 @@ def _inverted(mask: MaskFacts) -> bool:
 
 
 def _sound(mask: MaskFacts) -> bool:
-    return not (_unit_mask(mask) or _empty(mask) or _full(mask) or _inverted(mask))
+    return not (_other_levels(mask) or _empty(mask) or _full(mask) or _inverted(mask))
 
 
 def sound_mask(view: ViewFacts) -> bool:
@@ -78,12 +82,16 @@ def _faulty_masks(evidence: Evidence, is_faulty: Callable[[MaskFacts], bool], wh
 
 
 @rule("HB307", "error")
-def _unit_masks(evidence: Evidence) -> Iterator[Hit]:
-    """A mask has values 0 and 1 instead of 255.
+def _mask_levels(evidence: Evidence) -> Iterator[Hit]:
+    """A mask has other levels than 0 to 255.
 
-    Multiply it by 255 before saving.
+    Scale it before saving: masks of 0 and 1 by 255, of video's limited range from 16 and 235.
     """
-    yield from _faulty_masks(evidence, _unit_mask, "the mask has only the values 0 and 1 out of 255,")
+    found = [mask for _, mask in _masks(evidence) if _other_levels(mask)]
+    if found:
+        low, high = min(mask.low for mask in found), max(mask.high for mask in found)
+        what = f"the mask's levels lie from {low} to {high}, not from 0 to 255,"
+        yield from _faulty_masks(evidence, _other_levels, what)
 
 
 @rule("HB304", "error")
