@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
+from typing import cast
 
 import numpy as np
 
-from ...bench.contracts import FloatArray
+from ...bench.contracts import ByteArray, FloatArray
 from ...bench.progress import counted
 from ..ga import layout
 from ..ga.cameras import ROTATION_TOLERANCE, contradicted_focal, same_intrinsics
@@ -279,15 +280,14 @@ def _ignored(evidence: Evidence) -> Iterator[Hit]:
 def cy_evidence_views(evidence: Evidence) -> list[OutlineView]:
     """Views for comparing outlines, with cameras whose cy is measured from the top."""
     views = []
+    mask = cast("Callable[[FrameEntry], ByteArray]", evidence.pixels.mask)  # of frames that have one
     for view in evidence.views:
         mesh = view.mesh
         if mesh is None or mesh.depth <= 0 or not sound_mask(view) or "cy" not in view.entry.intrinsics:
             continue
         K = mesh.camera.K.copy()
         K[:2, 2] = view.entry.intrinsics.get("cx", 0), view.entry.intrinsics["cy"]
-        views.append(
-            OutlineView(mesh.vertices, replace(mesh.camera, K=K), partial(evidence.pixels.mask, view.entry))
-        )
+        views.append(OutlineView(mesh.vertices, replace(mesh.camera, K=K), partial(mask, view.entry)))
     return views
 
 

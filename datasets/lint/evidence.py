@@ -188,9 +188,10 @@ THOROUGH_TIMESTEPS = 32
 """Timesteps on which cameras are measured with ``--thorough``."""
 
 
-BRIEF_PIXELS, BRIEF_LEAST = (5_000_000, 30_000_000), (12, 2)
-"""Before a run, numbers of pixels to decode for the views and to measure cameras, a few seconds each; and the least numbers
-of views and timesteps, even if their images are larger."""
+FEW_PIXELS, FEWEST_VIEWS = 5_000_000, 12
+FEW_SHOTS, FEWEST_TIMESTEPS = 48, 2
+"""Before a run, most pixels of the views and most images to measure cameras on, which take a few seconds; and numbers of views
+and timesteps that are taken in any case."""
 
 
 class Slot(NamedTuple):
@@ -340,14 +341,14 @@ def gather_clip(
     """Evidence from a clip of any reader, without the layout's files.
 
     ``before_run`` takes only what the errors need that are searched for before a run: digests of image files that have
-    the same size as one of another split, views and measured cameras up to `BRIEF_PIXELS`; no search for near-duplicates and no
+    the same size as one of another split, fewer views and measurements of cameras; no search for near-duplicates and no
     fit of expressions. Of the layout, what its reader recorded is then used as well.
     """
     record = next((step.parameters for step in clip.steps if step.name == "read_capture"), None)
     record = record if before_run else None
     cy: CyConvention = "top" if record is None else record["cy"]
     settings = replace(settings, cy=cy) if record is not None else settings
-    rig = {
+    rig: dict[str, dict[str, Any]] = {
         name: {
             "camera_index": index,
             "camera_id": name,
@@ -432,9 +433,8 @@ def _looked_at(
     count, timesteps = settings.views, settings.camera_timesteps
     if before_run:
         sizes = {entry.camera_id: (entry.width or 0) * (entry.height or 0) for entry in whole}
-        one, every = max(1, *sizes.values()), max(1, sum(sizes.values()))
-        count = min(count, max(BRIEF_LEAST[0], BRIEF_PIXELS[0] // one))
-        timesteps = min(timesteps, max(BRIEF_LEAST[1], BRIEF_PIXELS[1] // every))
+        count = min(count, max(FEWEST_VIEWS, FEW_PIXELS // max(1, *sizes.values())))
+        timesteps = min(timesteps, max(FEWEST_TIMESTEPS, FEW_SHOTS // max(1, len(sizes))))
     chosen = whole if settings.thorough else pick_views(whole, count)
     views = inspect_views(chosen, pixels, subject, parameters, background, cy, progress=progress)
     limit = len(whole) if settings.thorough else settings.duplicates

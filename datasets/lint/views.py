@@ -240,7 +240,7 @@ def _blank(image: ByteArray, shown: np.ndarray, off: np.ndarray) -> bool:
     return bool(shown.any() and off[shown].mean() > 0.5 and structure(grey, shown) < BLANK_LEVELS)
 
 
-def _mask_facts(image: ByteArray, mask: ByteArray, off: np.ndarray, ground: FloatArray) -> MaskFacts:
+def _mask_facts(image: ByteArray, mask: ByteArray, off: np.ndarray, ground: np.ndarray) -> MaskFacts:
     covered = mask > 127
     distance = cv2.distanceTransform((mask == 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     far = (mask == 0) & (distance > FAR * len(mask)) if (mask > 0).any() else mask == 0
@@ -255,7 +255,7 @@ def _mask_facts(image: ByteArray, mask: ByteArray, off: np.ndarray, ground: Floa
     )
 
 
-def _fringe(image: ByteArray, mask: ByteArray, ground: FloatArray) -> float | None:
+def _fringe(image: ByteArray, mask: ByteArray, ground: np.ndarray) -> float | None:
     """See `MaskFacts.fringe`."""
     alpha = mask.astype(np.float32) / 255
     inner = (alpha > 0.98).astype(np.float32)
