@@ -142,7 +142,7 @@ def _run(
     known: set[str] = set()
     with suppress(InputError):  # of a new run, or of one whose record is damaged
         earlier = folder.read_manifest()
-        known, unchecked = {clip.fingerprint for clip in earlier.clips}, unchecked or earlier.unchecked
+        known, unchecked = {clip.fingerprint for clip in earlier.clips}, unchecked or bool(earlier.unchecked)
     if not config.drive:
         warn_of_missing_metrics(metrics, clips[0])
     if not unchecked and not config.source:
@@ -155,7 +155,7 @@ def _run(
         for job in jobs
         if job.adapted is not None and job.seed == config.seeds[0]
     )
-    manifest = replace(planned, adapted=forms, unchecked=unchecked, **record)
+    manifest = replace(planned, adapted=forms, unchecked=unchecked or None, **record)
     manifest.write(folder.manifest)
     for reason in {} if config.drive else missing_tasks(config.tasks, protocols).values():
         log.warning("%s", reason)

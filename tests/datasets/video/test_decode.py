@@ -165,7 +165,7 @@ def test_matrix_range_and_depth_do_not_change_colours(tmp_path, pixels, properti
     assert np.abs(next(video_frames(path)).image.astype(int) - [200, 60, 90]).max() <= 2
 
 
-def test_frames_outside_an_edit_list_and_cover_pictures_are_no_frames(tmp_path):
+def test_hidden_frames_and_cover_pictures_are_no_frames(tmp_path):
     path = write(tmp_path / "a.mp4", range(0, 400, 40), hidden=160)
     assert levels(video_frames(path)) == [*range(4, 10)]
     assert probe_video(path).frames == 6
