@@ -6,7 +6,8 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -65,6 +66,22 @@ def content_digests(
         settled = [path for path in paths if stamps[path].changed < limit and Stamp.of(path) == stamps[path]]
         _write_cache(place, {_name(stamps[path]): result[path] for path in settled})
     return result
+
+
+def digests_of_same_size(
+    splits: Mapping[str, Sequence[Path]], *, progress: Progress = no_progress
+) -> dict[Path, str]:
+    """Digests as by `content_digests` of the files that have the same size as one of another split.
+
+    Paths that name no file are left out.
+    """
+    sizes = {path: path.stat().st_size for part in splits.values() for path in part if path.is_file()}
+    splits_of: dict[int, set[str]] = defaultdict(set)
+    for split, part in splits.items():
+        for path in part:
+            if path in sizes:
+                splits_of[sizes[path]].add(split)
+    return content_digests((p for p, size in sizes.items() if len(splits_of[size]) > 1), progress=progress)
 
 
 def digests_below(

@@ -14,6 +14,7 @@ from headbench.bench.protocol import make_protocols
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.lint.before_run import errors
 from headbench.datasets.monocular.clip import CONVENTION, _last
 from headbench.datasets.monocular.reader import find_videos, read_video
 from headbench.datasets.open import find_reader, open_clip
@@ -78,6 +79,7 @@ def test_a_video_shows_what_its_capture_shows(recordings, written, kind):
         difference = clip.image(key).astype(int) - recording.clip.image(source)
         assert np.abs(difference).max() <= 1
     assert check_clip(clip) == []
+    assert errors(clip) == []
 
 
 def test_eyelids_without_a_basis_are_said(tmp_path, caplog):
