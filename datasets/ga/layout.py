@@ -43,6 +43,7 @@ SPLIT_FILES = {
 }
 ALL_FRAMES_FILE = "transforms.json"
 CANONICAL_FILE = "canonical_flame_param.npz"
+TRACKING_FOLDER = "flame_param"
 DECLARATION_FILE = "headbench.json"
 HEAD_FILE = "head_model.npz"
 TRAIN_SEQUENCES_FILE = "sequences_trainval.txt"

@@ -181,7 +181,7 @@ def find_captures(root: Path) -> list[Path]:
     if not root.exists():
         raise InputError(root, "", expected, "no such folder")
     if any((root / file).exists() for file in (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)):
-        if (root / "flame" / "exp").is_dir() and not (root / "flame_param").is_dir():
+        if (root / "flame" / "exp").is_dir() and not (root / layout.TRACKING_FOLDER).is_dir():
             raise InputError(
                 root, "", expected, "a capture of INSTA, whose JSONs have the same names", MONOCULAR
             )
@@ -194,7 +194,7 @@ def find_captures(root: Path) -> list[Path]:
 
 def find_capture(path: str | Path) -> Path:
     """The only capture at ``path``. Raises `InputError` if there is none or several."""
-    folder = Path(os.path.abspath(path))  # "." has no name for a subject
+    folder = Path(os.path.realpath(path))  # neither "." nor a link names a subject or sequence
     captures = find_captures(folder)
     if len(captures) != 1:
         found = ", ".join(capture.name for capture in captures)

@@ -84,7 +84,8 @@ def check_timesteps(folder: Path, entries: Sequence[FrameEntry]) -> None:
     first: dict[int, FrameEntry] = {}
     for entry in entries:
         other = first.setdefault(entry.timestep, entry)
-        if (entry.parameters, entry.sequence_folder) != (other.parameters, other.sequence_folder):
+        one, two = (os.path.abspath(e.parameters) for e in (entry, other))
+        if (one, entry.sequence_folder) != (two, other.sequence_folder):
             raise InputError(
                 entry.file,
                 f"{entry.where}.flame_param_path",

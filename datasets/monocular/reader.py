@@ -213,7 +213,7 @@ def read_video(
     exclude, cache_mb, use_cache : Mapping[int, str] | str | Path | None, float, bool
         As for the reader ``ga``.
     """
-    root = Path(os.path.abspath(path))
+    root = Path(os.path.realpath(path))
     declaration = Declaration.read(root)
     asset = _find_head(root, declaration, head, masks=masks, regions=regions, eyelids=eyelids)
     track = _read_track(root, asset, progress)
