@@ -131,11 +131,14 @@ def read_capture(
         splits = split_by_holding_out(folder, frames, held_out_sequences, held_out_cameras)
     # All files of the clip except the head model, which may be elsewhere and has its own digest.
     used = {file for e in everything for file in (e.file, e.image, e.mask, e.parameters) if file is not None}
-    used |= {folder / layout.DECLARATION_FILE} if declaration else set()
     images = {
         FrameKey(subject, names[e.sequence_folder], e.timestep, e.camera_id): e.image for e in everything
     }
     contents = digests_below(folder, used, use_cache=use_cache, progress=progress)
+    if declaration:
+        ordered = sorted(everything, key=lambda e: e.timestep)
+        folders = dict.fromkeys(e.sequence_folder for e in ordered)
+        contents[layout.DECLARATION_FILE] = declaration.digest(folders)
     found = find_leaks(splits, images, progress=progress)
     record = {
         "cy": convention,
