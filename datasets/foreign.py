@@ -24,7 +24,7 @@ RIG = (
     "folder of its export in GaussianAvatars' layout."
 )
 MONOCULAR = (
-    "Complete folders are recognised: the output of INSTA's generate.sh for Metrical Tracker (transforms_train.json, "
+    "The reader monocular, which commands choose by the content, reads complete folders: the output of INSTA's generate.sh for Metrical Tracker (transforms_train.json, "
     "flame/exp, meshes, canonical.obj), and IMavatar's flame_params.json with its list of frames. A motion of LAM "
     "(flame_params.json of arrays) is for `headbench drive`."
 )

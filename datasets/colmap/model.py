@@ -183,7 +183,7 @@ def _images_text(file: Path) -> Iterator[tuple[int, ColmapImage]]:
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
     """Number and text of each line except comments. An empty line may be an image without points."""
     lines = enumerate(read_text(file, "COLMAP text").split("\n"), start=1)
-    return ((number, line) for number, line in lines if not line.startswith("#"))
+    return ((number, line) for number, line in lines if not line.lstrip().startswith("#"))
 
 
 def find_model(path: str | PathLike[str]) -> tuple[Path, Path] | None:

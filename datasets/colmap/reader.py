@@ -170,9 +170,10 @@ def read_dataset(
     splits = split_by_holding_out(root, files, held_out_sequences, held_out_cameras)
     if not splits["train"]:
         raise InputError(root, "splits", "training frames left", "none left")
-    used = {*timesteps.values(), *model.files}
+    used = {*timesteps.values()}
     used |= {file for frame in files.values() for file in (frame.image, frame.mask) if file is not None}
     contents = digests_below(root, used, use_cache=use_cache, progress=progress)
+    contents["model"] = digest(sorted(model.cameras.items()), sorted(model.images.items()))
     declared = declaration.background if declaration else (1.0, 1.0, 1.0)
     ground = check_colour(declared if background is None else background)
     source = digest(tracking.head.fingerprint(), contents, subject, ground)

@@ -118,7 +118,9 @@ def find_leaks(
         names = f"{one} and {other}"
         shared = sorted({images[key] for key in splits[one]} & {images[key] for key in splits[other]})
         if shared:
-            found.append(f"{len(shared)} image files are in both {names}, such as {shared[0]}")
+            found.append(
+                f"{len(shared)} image files are in both {names}, such as {'/'.join(shared[0].parts[-3:])}"
+            )
             continue
         by_content = {contents[images[key]]: key for key in splits[one] if images[key] in contents}
         equal = [key for key in splits[other] if contents.get(images[key]) in by_content]

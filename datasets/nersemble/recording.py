@@ -30,7 +30,7 @@ from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json, read_text
 from ...bench.io.files import check_name, entries, reading
-from ..ga.transforms import found_entry, read_matrix, read_rigid
+from ..ga.transforms import MAX_INTEGER, found_entry, read_matrix, read_rigid
 from .names import BACKGROUND, FULL_SIZE, is_subject, match_sequence, serial_of
 from .pixels import Correction, affine_correction, polynomial_correction
 
@@ -268,9 +268,10 @@ def _size(path: Path, value: Mapping[str, Any], per_camera: bool) -> tuple[int, 
     sizes = []
     for key in ("width", "height"):
         number = value.get(key)
-        if not isinstance(number, int) or isinstance(number, bool) or number < 1:
+        whole = isinstance(number, (int, float)) and not isinstance(number, bool) and number % 1 == 0
+        if not whole or not 1 <= number < MAX_INTEGER:
             raise InputError(path, key, "a number of pixels from 1", found_entry(number))
-        sizes.append(number)
+        sizes.append(int(number))
     return sizes[0], sizes[1]
 
 

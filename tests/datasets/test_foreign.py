@@ -36,7 +36,7 @@ CASES = {
         ["train/flame_params.json", "test/flame_params.json"],
         "",
         "IMavatar",
-        "recognised",
+        "monocular",
     ),
     "LAM": (["flame_params.json", "flame_param/00000.npz"], "", "LAM", "headbench drive"),
     "INSTA": (["canonical.obj", "meshes/1.obj", "images/1.png"], "", "INSTA", "generate.sh"),
