@@ -1,4 +1,10 @@
-"""Read a transforms JSON into validated frame entries; errors name file and frame."""
+"""Read a transforms JSON into validated frame entries; errors name file and frame.
+
+Formats read:
+
+- Transforms JSON of GaussianAvatars. Written by ShenhanQian/VHAP@4b64ab7d (`vhap/export_as_nerf_dataset.py`,
+  `vhap/combine_nerf_datasets.py`). Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 

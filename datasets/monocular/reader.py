@@ -2,6 +2,10 @@
 
 The layouts are those of `insta` and `imavatar`. VHAP's monocular export has GaussianAvatars' layout and is
 read by the reader ``ga``.
+
+Formats read:
+
+- IMavatar's `flame_params.json`. Written by zhengyuf/IMavatar@923b60aa (`preprocess/DECA/optimize.py`). Not checked on a file of the program.
 """
 
 from __future__ import annotations

@@ -13,6 +13,12 @@ The benchmark toolkit's folders read as the second release. Parts of the first r
 
 ``camera_params.json`` holds world-to-camera matrices with OpenCV axes in metres, and one intrinsic matrix for all
 cameras (raw recordings) or one per camera (the benchmark's cropped videos); no lens distortion.
+
+Formats read:
+
+- NeRSemble's `camera_params.json`. Written by the authors of tobias-kirschstein/nersemble-data@14e967e3 and
+  tobias-kirschstein/nersemble-benchmark@e15f204d, whose readers it follows. Not checked on a file of the program.
+- NeRSemble's `metadata_sequences.csv`. Written by the authors of tobias-kirschstein/nersemble-data@14e967e3. Not checked on a file of the program.
 """
 
 from __future__ import annotations
