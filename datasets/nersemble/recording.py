@@ -274,8 +274,8 @@ def _size(path: Path, value: Mapping[str, Any], per_camera: bool) -> tuple[int, 
     sizes = []
     for key in ("width", "height"):
         number = value.get(key)
-        whole = isinstance(number, (int, float)) and not isinstance(number, bool) and number % 1 == 0
-        if not whole or not 1 <= number < MAX_INTEGER:
+        plain = isinstance(number, (int, float)) and not isinstance(number, bool)
+        if number is None or not plain or not 1 <= number < MAX_INTEGER or number % 1:
             raise InputError(path, key, "a number of pixels from 1", found_entry(number))
         sizes.append(int(number))
     return sizes[0], sizes[1]
