@@ -144,11 +144,16 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file atomically, keys in the order given, numpy scalars and arrays as numbers and lists.
+    """Write `json_text` of a value atomically."""
+    write_text(path, json_text(value))
+
+
+def json_text(value: Any) -> str:
+    """Content of a JSON file, keys in the order given, numpy scalars and arrays as numbers and lists.
 
     Raises `ValueError` for a non-finite number, which JSON cannot represent.
     """
-    write_text(path, json.dumps(value, indent=1, default=to_jsonable, allow_nan=False) + "\n")
+    return json.dumps(value, indent=1, default=to_jsonable, allow_nan=False) + "\n"
 
 
 def check_writable(path: Path, option: str) -> None:

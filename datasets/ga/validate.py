@@ -84,7 +84,8 @@ def check_timesteps(folder: Path, entries: Sequence[FrameEntry]) -> None:
     first: dict[int, FrameEntry] = {}
     for entry in entries:
         other = first.setdefault(entry.timestep, entry)
-        if (entry.parameters, entry.sequence_folder) != (other.parameters, other.sequence_folder):
+        one, two = (os.path.abspath(e.parameters) for e in (entry, other))
+        if (one, entry.sequence_folder) != (two, other.sequence_folder):
             raise InputError(
                 entry.file,
                 f"{entry.where}.flame_param_path",
@@ -112,7 +113,9 @@ def find_leaks(
         names = f"{one} and {other}"
         shared = sorted({images[key] for key in splits[one]} & {images[key] for key in splits[other]})
         if shared:
-            found.append(f"{len(shared)} image files are in both {names}, such as {shared[0]}")
+            found.append(
+                f"{len(shared)} image files are in both {names}, such as {'/'.join(shared[0].parts[-3:])}"
+            )
             continue
         by_content = {contents[images[key]]: key for key in splits[one] if images[key] in contents}
         equal = [key for key in splits[other] if contents.get(images[key]) in by_content]
