@@ -154,7 +154,13 @@ def test_formats_state_writer_and_check(reference):
         assert re.search(r"\w+/[\w.-]+@[0-9a-f]{8}\b|package|wheel", check), check
 
 
-READ_PACKAGES = ("datasets/ga", "datasets/colmap", "datasets/monocular", "datasets/nersemble", "datasets/tracker_files")
+READ_PACKAGES = (
+    "datasets/ga",
+    "datasets/colmap",
+    "datasets/monocular",
+    "datasets/nersemble",
+    "datasets/tracker_files",
+)
 """Packages of readers of other programs' captures."""
 
 
