@@ -107,6 +107,8 @@ LATEX_ESCAPES = {
     '"': "''",
     "[": "{[}",
     "]": "{]}",
+    "*": "{*}",  # after the end of a row it would be the star of that command
+    "`": "{`}",  # a question mark before it would be inverted
     "–": "--",
     "—": "---",
     "…": r"\dots{}",
@@ -192,11 +194,14 @@ def to_latex(table: Table) -> str:
 def escape_latex(text: str) -> str:
     """Escape text for LaTeX, on one line; characters that pdfLaTeX's fonts lack become code points."""
 
-    def escaped(character: str) -> str:
-        known = 32 <= ord(character) < 127 or (192 <= ord(character) < 256 and character.isalpha())
-        return LATEX_ESCAPES.get(character, character if known else rf"\texttt{{U+{ord(character):04X}}}")
+    def escaped(match: re.Match[str]) -> str:
+        found = match[0]
+        if len(found) > 1:  # hyphens, which would become a dash
+            return "{}".join(found)
+        known = " " <= found <= "~" or ("À" <= found <= "ÿ" and found.isalpha() and found not in "ÐÞðþ")
+        return LATEX_ESCAPES.get(found, found if known else rf"\texttt{{U+{ord(found):04X}}}")
 
-    return "".join(map(escaped, unicodedata.normalize("NFC", " ".join(text.split()))))
+    return re.sub("--+|.", escaped, unicodedata.normalize("NFC", " ".join(text.split())))
 
 
 def _latex_cell(cell: TableCell) -> str:

@@ -207,19 +207,19 @@ def to_markdown(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) ->
 
 def to_junit(verdicts: Sequence[Verdict], notes: Sequence[str]) -> str:
     """JUnit XML with a suite for each task: regressed is a failure, missing an error, unjudged skipped."""
-    root = ElementTree.Element("testsuites", name="headbench compare")
+    root = ElementTree.Element("testsuites", name="headbench compare", time="0")
     for task in dict.fromkeys(verdict.place.task for verdict in verdicts):
         own = [verdict for verdict in verdicts if verdict.place.task == task]
         counts = Counter(verdict.outcome for verdict in own)
         numbers = {"tests": len(own), "failures": counts["regressed"]}
-        numbers |= {"errors": counts["missing"], "skipped": counts["unjudged"]}
+        numbers |= {"errors": counts["missing"], "skipped": counts["unjudged"], "time": 0}
         attributes = {"name": _xml(task), **{name: str(number) for name, number in numbers.items()}}
         suite = ElementTree.SubElement(root, "testsuite", attributes)
         for verdict in own:
             place = verdict.place
             name = _xml(f"{place.metric} {place.region} subject {place.subject}")
             case = ElementTree.SubElement(
-                suite, "testcase", classname=_xml(f"{task}.{place.method}"), name=name
+                suite, "testcase", classname=_xml(f"{task}.{place.method}"), name=name, time="0"
             )
             kind = {"regressed": "failure", "missing": "error", "unjudged": "skipped"}.get(verdict.outcome)
             if kind:
@@ -237,10 +237,10 @@ def failed_markdown(message: str) -> str:
 
 def failed_junit(message: str) -> str:
     """The JUnit XML for missing or invalid results or baseline: one test case, with an error."""
-    root = ElementTree.Element("testsuites", name="headbench compare")
-    counts = {"tests": "1", "failures": "0", "errors": "1", "skipped": "0"}
+    root = ElementTree.Element("testsuites", name="headbench compare", time="0")
+    counts = {"tests": "1", "failures": "0", "errors": "1", "skipped": "0", "time": "0"}
     suite = ElementTree.SubElement(root, "testsuite", {"name": "gate", **counts})
-    case = ElementTree.SubElement(suite, "testcase", classname="gate", name="results and baseline")
+    case = ElementTree.SubElement(suite, "testcase", classname="gate", name="results and baseline", time="0")
     ElementTree.SubElement(case, "error", message=_xml(message))
     return _document(root)
 

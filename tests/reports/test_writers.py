@@ -135,7 +135,13 @@ def test_latex_has_a_short_caption_and_the_protocol_in_comments(table):
 
 
 def test_latex_compiles_whatever_names_hold(table, tmp_path):
-    names = [NASTY, "ours_2 50% #1 & \\input{x} ^ ~", "naïve Ærø ÿ", "日本語 – “x” …", "a\nb \\end{tabular}"]
+    names = [
+        NASTY,
+        "ours_2 50% #1 & \\input{x} ^ ~",
+        "naïve Ærø ÿ",
+        "*日本語 – “x” …",
+        "[Ð--þ\nb \\end{tabular}",
+    ]
     noted = table.notes[0] + " ".join(names)
     tables = [
         replace(
@@ -154,6 +160,18 @@ def test_latex_compiles_whatever_names_hold(table, tmp_path):
 def marked(cells):
     """The cells, each with a note."""
     return tuple(replace(cell, note=0) for cell in cells)
+
+
+@pytest.mark.parametrize(
+    ("text", "escaped"),
+    [
+        *(("*ours", "{*}ours"), ("[ours]", "{[}ours{]}")),  # "\\\\*" and "\\\\[" are other commands
+        *(("a-b--c---d", "a-b-{}-c-{}-{}-d"), ("why?`", "why?{`}")),  # ligatures
+        ("þ ø", r"\texttt{U+00FE} ø"),  # the first is not in the default encoding of fonts
+    ],
+)
+def test_latex_prints_the_characters_of_a_name(text, escaped):
+    assert escape_latex(text) == escaped
 
 
 @given(st.text(max_size=40))
