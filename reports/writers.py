@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..bench import terminal
 from ..bench.io.provenance import tool
-from ..bench.io.style import SHAPES, stylesheet
+from ..bench.io.style import SHAPES, escape_markdown, stylesheet
 from .compact import compact
 from .tables import METHODS_TITLE, TITLES, Column, Table, TableCell
 
@@ -54,11 +54,6 @@ def to_markdown(table: Table) -> str:
 def pipe_table(lines: Iterable[Sequence[str]]) -> str:
     """Lines of cells, the second with the rules, as a pipe table."""
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def escape_markdown(text: str) -> str:
-    """Escape text for Markdown, on one line; an underscore within a word needs no escape."""
-    return re.sub(r"([\\`*{}\[\]<>|#~&]|(?<!\w)_|_(?!\w))", r"\\\1", " ".join(text.split()))
 
 
 def _markdown_cell(cell: TableCell) -> str:

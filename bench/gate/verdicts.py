@@ -9,6 +9,7 @@ from typing import Any, Literal
 from xml.etree import ElementTree
 
 from ..errors import ExitCode, shortened
+from ..io.style import escape_markdown
 from .baseline import MACHINE, Baseline, ResultKey, Results, Tolerance
 
 Outcome = Literal["pass", "regressed", "improved", "missing", "new", "unjudged"]
@@ -201,7 +202,7 @@ def to_markdown(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) ->
         lines += [*_table(others), ""]
     if rest:
         lines += [f"<details><summary>{len(rest)} passed</summary>", "", *_table(rest), "", "</details>", ""]
-    lines += [f"- {_escaped(note)}" for note in notes]
+    lines += [f"- {escape_markdown(note)}" for note in notes]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -232,7 +233,7 @@ def to_junit(verdicts: Sequence[Verdict], notes: Sequence[str]) -> str:
 
 def failed_markdown(message: str) -> str:
     """The summary for missing or invalid results or baseline."""
-    return f"### Gate: {TITLES[3]}\n\n{_escaped(message)}\n"
+    return f"### Gate: {TITLES[3]}\n\n{escape_markdown(message)}\n"
 
 
 def failed_junit(message: str) -> str:
@@ -267,15 +268,8 @@ def _table(verdicts: Sequence[Verdict]) -> list[str]:
         numbers = ["" if value is None else format(value, form) for value, form in zip(values, forms)]
         numbers[1] = numbers[1] or verdict.reason
         named = [verdict.outcome, place.task, place.method, place.subject, f"{place.measured}{unit}"]
-        lines.append("| " + " | ".join(_escaped(cell) for cell in [*named, *numbers]) + " |")
+        lines.append("| " + " | ".join(escape_markdown(cell) for cell in [*named, *numbers]) + " |")
     return lines
-
-
-def _escaped(text: str) -> str:
-    """Text that stays in its cell of a Markdown table and is no markup."""
-    for character in "\\|<>*_`[]":
-        text = text.replace(character, f"\\{character}")
-    return " ".join(text.split())
 
 
 def _xml(text: str) -> str:
