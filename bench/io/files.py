@@ -144,8 +144,14 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write `json_text` of a value atomically."""
-    write_text(path, json_text(value))
+    """Write `json_text` of a value atomically.
+
+    Raises `InputError` for a name of a file that is not in UTF-8, which could not be read back.
+    """
+    text = json_text(value)
+    if "\\ud" in text:
+        check_utf8(json.dumps(json.loads(text), ensure_ascii=False), path, "", "names")
+    write_text(path, text)
 
 
 def json_text(value: Any) -> str:
@@ -154,6 +160,16 @@ def json_text(value: Any) -> str:
     Raises `ValueError` for a non-finite number, which JSON cannot represent.
     """
     return json.dumps(value, indent=1, default=to_jsonable, allow_nan=False) + "\n"
+
+
+def check_utf8(text: str, source: str | os.PathLike[str], key: str, what: str) -> None:
+    """Raise `InputError` for text with file names in another encoding, which JSON, Parquet and other libraries do not take."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        found = text[max(0, error.start - 40) : error.end + 40]
+        remedy = "Rename the file or the folder, for example with convmv."
+        raise InputError(source, key, f"{what} in UTF-8", found, remedy) from error
 
 
 def check_writable(path: Path, option: str) -> None:
@@ -243,6 +259,7 @@ def check_room(folder: Path) -> None:
 
 @contextmanager
 def _writable(path: Path, option: str, what: str) -> Iterator[None]:
+    check_utf8(os.path.abspath(path), "command line", option, f"the path of {what}")
     try:
         yield
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
