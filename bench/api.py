@@ -202,13 +202,15 @@ def evaluate(
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
-def run(data: Path | str, out: Path | str, **settings: Any) -> Path:
+def run(data: Path | str, out: Path | str, *, unchecked: bool = False, **settings: Any) -> Path:
     """Run a comparison, or continue one: train, render, measure, write tables and images.
 
     Parameters
     ----------
     data, out : Path | str
         Capture, and output folder of the run.
+    unchecked : bool
+        Do not search the captures for errors of `headbench lint`, which stop a run.
     settings : Any
         Further fields of `RunConfig`, such as ``methods=("ga", "ours"), preset="smoke", seeds=(0,
         1)``.
@@ -226,7 +228,7 @@ def run(data: Path | str, out: Path | str, **settings: Any) -> Path:
     values = {"data": str(data), "out": str(out), **settings}
     if "reader" not in values:
         values["reader"] = reader_of(str(data))
-    runner.run(build_run_config(values, "run"))
+    runner.run(build_run_config(values, "run"), unchecked=unchecked)
     return Path(out)
 
 

@@ -11,6 +11,7 @@ import traceback
 from importlib.metadata import version
 
 from .errors import ExitCode, HeadbenchError, Interruption
+from .machine import limit_threads
 from .streams import prepare_streams, show
 from .terminal import wrapped
 
@@ -20,6 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     # OpenMP's workers spin by default while they wait, which makes several threads many times slower than one on a
     # busy machine, so let them sleep. The variable is read once, when torch is first imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    limit_threads()
     prepare_streams()
     words = sys.argv[1:] if arguments is None else arguments
     try:

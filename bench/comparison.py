@@ -160,7 +160,7 @@ class RunSettings:
     workers: int | None = None
     """Number of processes, with `--executor processes`. Default: one for each core."""
     unchecked: bool = False
-    """Train even if `headbench lint` finds an error that makes the results of a capture meaningless."""
+    """Do not search the captures for errors of `headbench lint`, which stop a run; the record of the run says so."""
     dry_run: bool = False
     """Check everything and list the cells; train nothing."""
     set: Assignments = ()

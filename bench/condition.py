@@ -110,6 +110,11 @@ class Condition:
         """Whether methods train with a budget other than the run's."""
         return seconds_of_text(self.budget) is not None or self.part != 1
 
+    @property
+    def changes_settings_alone(self) -> bool:
+        """Whether it changes settings of methods and nothing else."""
+        return bool(self.settings) and self == Condition(self.name, self.methods, self.settings)
+
     def part_of(self, whole: Budget) -> Budget:
         """The fraction of a budget, at least one iteration; or the training time instead."""
         seconds = seconds_of_text(self.budget)

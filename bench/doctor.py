@@ -99,7 +99,7 @@ def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
     unavailable = [status for status in statuses if status.counts and status.state == "missing"]
     machine = machine_record(settings.device)
     head = (
-        f"{machine['processor']}, {machine['cores']} cores, {machine['memory_bytes'] / 1e9:.0f} GB; "
+        f"{machine['processor']}, {machine['cores']} core{'s' * (machine['cores'] != 1)}, {machine['memory_bytes'] / 1e9:.0f} GB; "
         f"Python {machine['python']}, torch {machine['packages']['torch']}"
     )
     what = "The methods named" if named else "All default methods"

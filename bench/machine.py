@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -27,26 +28,64 @@ RECORDED_PACKAGES = ("headbench", "torch", "gsplat", "numpy", OPENCV, "scikit-im
 ACCELERATOR_FIELDS = ("name", "driver_version", "memory.total", "power.limit", "clocks.sm", "clocks.max.sm")
 RUSAGE_UNIT = 1 if sys.platform == "darwin" else 1024
 STATUS, RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+CGROUPS, OWN_CGROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def processor_count() -> int:
-    """Processor cores this process may use."""
+    """Number of threads for which this process has a core each, at least 1; see `processor_capacity`."""
+    return max(1, int(processor_capacity()))
+
+
+def processor_capacity() -> float:
+    """Processor cores that this process may use: those of its affinity or, if less, the quota of its cgroups.
+
+    The quota limits the mean over all cores, so it may be a fraction. Container engines set it (``docker run --cpus 1.5``).
+    """
+    names = ("cpu.max", "cpu.cfs_quota_us", "cpu.cfs_period_us")
+    quotas = [int(words[0]) / int(words[1]) for words in _cgroup_limits("cpu", *names)]
+    capacity = min([_allowed_cores(), *quotas])
+    return int(capacity) if capacity == int(capacity) else round(capacity, 2)
+
+
+def limit_threads() -> None:
+    """Let OpenMP, and with it torch and the kernels, use only as many threads as the quota allows; before torch is imported."""
+    if processor_count() < _allowed_cores():
+        os.environ.setdefault("OMP_NUM_THREADS", str(processor_count()))
+
+
+def _allowed_cores() -> int:
     available = getattr(os, "sched_getaffinity", None)  # not on every system
     return len(available(0)) if available else os.cpu_count() or 1
 
 
+def _cgroup_limits(controller: str, *names: str) -> Iterator[list[str]]:
+    """Words of the files ``names`` of every cgroup of this process that limits a controller; of versions 1 and 2."""
+    lines = OWN_CGROUPS.read_text(encoding="utf-8").splitlines() if OWN_CGROUPS.exists() else []
+    for _, controllers, own in (line.split(":", 2) for line in lines):
+        if controllers and controller not in controllers.split(","):
+            continue
+        # In a container the path may be that outside, which does not exist here.
+        place = (CGROUPS / controller if controllers else CGROUPS) / own.lstrip("/")
+        for folder in (place, *place.parents):
+            files = [folder / name for name in names]
+            words = [word for file in files if file.is_file() for word in file.read_text("ascii").split()]
+            if words and words[0].isdigit():  # no limit is "max" or -1
+                yield words
+
+
 def machine_record(device: str = "cpu") -> dict[str, Any]:
-    """Processor, memory, system, the versions of packages that influence results, and headbench's git commit, if any.
+    """Processor, memory and cores within the limits of cgroups, system, the versions of packages that influence results, and headbench's git commit, if any.
 
     For a CUDA ``device`` the entry "device" has its name, memory, compute capability, the CUDA version of
     torch, and whether matrix products and convolutions may round to TF32.
     """
     import psutil
 
+    limits = (int(words[0]) for words in _cgroup_limits("memory", "memory.max", "memory.limit_in_bytes"))
     return {
         "processor": _processor(),
-        "cores": processor_count(),
-        "memory_bytes": psutil.virtual_memory().total,
+        "cores": processor_capacity(),
+        "memory_bytes": min([psutil.virtual_memory().total, *limits]),
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in RECORDED_PACKAGES},
@@ -221,7 +260,7 @@ class ProcessorLoad:
     """
 
     def __init__(self, device: str = "cpu", *, wait: bool = False) -> None:
-        self.machine, self.cores = machine_name(device), processor_count()
+        self.machine, self.cores = machine_name(device), processor_capacity()
         self.threads = 1
         self.other_cores: float | None = None
         self._wait = wait
@@ -252,8 +291,8 @@ class ProcessorLoad:
 
 def machine_name(device: str = "cpu") -> str:
     """Processor, number of usable cores and CUDA device; times are comparable only if they are equal."""
-    cores = processor_count()
-    name = f"{_processor()} ({cores} core{'s' * (cores > 1)})"
+    cores = processor_capacity()
+    name = f"{_processor()} ({cores} core{'s' * (cores != 1)})"
     record = _device_record(device).get("device")
     return shortened(name if record is None else f"{record['name']}, {name}", MAX_LABEL - 10)
 

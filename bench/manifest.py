@@ -154,6 +154,8 @@ class Manifest:
         Clips that were adapted to a method.
     capture_seconds : float | None
         Time that the demo took to make its capture.
+    unchecked : bool | None
+        True if the captures were not searched for errors that change results: `headbench run --unchecked`.
     """
 
     configuration: RunConfig
@@ -168,6 +170,7 @@ class Manifest:
     seconds: float | None = None
     peak_memory_bytes: int | None = None
     capture_seconds: float | None = None
+    unchecked: bool | None = None
     format: Literal[2] = 2
 
     @classmethod

@@ -305,7 +305,7 @@ class DatasetSpec:
     ``truth`` names a function ``clip -> GroundTruth`` for clips of captures that this entry made; it raises
     `UnavailableError` for others. "" for none.
     ``needs`` is defined as for a method and called with None for the config. ``errors`` names a function
-    ``clip -> list of text``: errors that make every result of the capture meaningless, checked before training; "" for none.
+    ``clip -> list of text``: errors of the capture that change results, searched for before training; "" for none.
     """
 
     name: str

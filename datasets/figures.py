@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from matplotlib import style
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 
 from ..bench.contracts import ByteArray
+from ..bench.io.figures import drawable
 
 Colour = tuple[int, int, int]
 
@@ -20,8 +20,6 @@ TRAIN, HELD_OUT = "#0072b2", "#d55e00"
 """Two of Okabe and Ito's colours, distinguishable with any colour vision."""
 MUTED, RULE, LEAK = "#737373", "#d6d6d6", "#be1e2d"
 DPI = 100
-LONGEST = 2**16 - 1
-"""Maximum side of a figure in matplotlib, pixels; larger figures get a lower resolution."""
 
 _STYLE: Any = {
     "text.parse_math": False,  # names may have dollar signs
@@ -55,14 +53,6 @@ def bands(figure: Figure, heights: Sequence[float]) -> list[SubFigure]:
     return list(np.asarray(figure.subfigures(len(heights), 1, height_ratios=heights)))
 
 
-def pixels(figure: Figure) -> ByteArray:
-    """(H, W, 3) 8-bit sRGB."""
-    figure.set_dpi(min(figure.dpi, LONGEST / max(figure.get_size_inches())))
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
 def show(axes: Axes, image: ByteArray, *, frame: bool = False) -> None:
     """Show an image on new axes without ticks."""
     axes.imshow(image)
@@ -71,7 +61,8 @@ def show(axes: Axes, image: ByteArray, *, frame: bool = False) -> None:
 
 
 def shortened(text: str, length: int) -> str:
-    """The text, shortened with an ellipsis to a number of characters."""
+    """The text as it is drawn, shortened with an ellipsis to a number of characters."""
+    text = drawable(text)
     return text if len(text) <= length else f"{text[: length - 1]}…"
 
 

@@ -19,16 +19,14 @@ HEADS = (".npz", ".pkl")
 LOOKED_AT = 2000
 """Maximum number of entries of a folder that are inspected."""
 
-TRACK = (
-    "headbench does not track: fit FLAME with VHAP to the video or images, export the result in GaussianAvatars' "
-    "layout, and give the folder of the export."
+RIG = (
+    "`headbench track` makes a capture of a video of one camera; for several cameras fit FLAME with VHAP, and give the "
+    "folder of its export in GaussianAvatars' layout."
 )
-
-
 MONOCULAR = (
-    "The reader monocular reads the output of INSTA's generate.sh for Metrical Tracker (transforms_train.json, "
-    "flame/exp, meshes, canonical.obj), and IMavatar's flame_params.json: choose it with --reader monocular "
-    "(`headbench run`: --set reader=monocular)."
+    "The reader monocular, which commands choose by the content, reads complete folders: the output of INSTA's generate.sh for Metrical Tracker (transforms_train.json, "
+    "flame/exp, meshes, canonical.obj), and IMavatar's flame_params.json with its list of frames. A motion of LAM "
+    "(flame_params.json of arrays) is for `headbench drive`."
 )
 
 
@@ -50,15 +48,17 @@ def frame_route(frame: Mapping[str, Any]) -> str:
         return ""
     if "mesh_path" in frame or "exp_path" in frame:
         return "Frames with meshes and coefficients are INSTA's: with flame/exp beside them the reader monocular reads them."
-    return f"It has only cameras, like the JSONs of nerfstudio and instant-ngp. {TRACK}"
+    return f"It has only cameras, like the JSONs of nerfstudio and instant-ngp. {RIG}"
 
 
 def _file(path: Path) -> Foreign:
     suffix = path.suffix.lower()
     if suffix in VIDEOS:
-        return Foreign("a video", TRACK)
+        return Foreign("a video", _track(_quoted(path)))
     if suffix in IMAGES:
-        return Foreign("an image", TRACK)
+        return Foreign(
+            "an image", "An avatar needs a video of the person: `headbench track` makes a capture of one."
+        )
     if suffix in ARCHIVES:
         return Foreign("an archive", "Unpack it and give the folder.")
     if path.name in (*SPLIT_FILES.values(), ALL_FRAMES_FILE):
@@ -138,7 +138,7 @@ def _tracked(path: Path, names: list[str]) -> Foreign | None:
             lambda name: name in ("point_cloud", "point_cloud.ply", "cfg_args"),
         ),
         (
-            "a capture of IMavatar or PointAvatar (flame_params.json)",
+            "flame_params.json of IMavatar, PointAvatar or LAM",
             MONOCULAR,
             lambda name: name == "flame_params.json" or (path / name / "flame_params.json").is_file(),
         ),
@@ -154,7 +154,7 @@ def _tracked(path: Path, names: list[str]) -> Foreign | None:
         ),
         (
             "a capture of Gaussian Head Avatar",
-            "headbench has no reader for it; prepare the NeRSemble recording from which it was made.",
+            "No reader reads it; prepare the NeRSemble recording from which it was made.",
             lambda name: name == "params" and {"images", "cameras"} <= set(names),
         ),
     )
@@ -165,7 +165,7 @@ def _cameras_only(path: Path, names: list[str]) -> Foreign | None:
     models = {"cameras.bin", "cameras.txt", "database.db"}
     if not models & set(names) and "sparse" not in names and not (path / "colmap").is_dir():
         return None
-    remedy = f"COLMAP gives cameras and no tracked head; with tracked parameters beside the model, choose the reader colmap (`headbench run`: --set reader=colmap). {TRACK}"
+    remedy = f"COLMAP gives cameras and no tracked head; the reader colmap reads images and model with flame_param beside them. {RIG}"
     return Foreign("a COLMAP dataset", remedy)
 
 
@@ -173,9 +173,25 @@ def _unprepared(path: Path, names: list[str]) -> Foreign | None:
     for what, suffixes in (("videos", VIDEOS), ("images", IMAGES), ("archives", ARCHIVES)):
         count = sum(name.lower().endswith(suffixes) or name == what for name in names)
         if 2 * count > len(names):
-            way = "Unpack them and give the folder." if what == "archives" else TRACK
+            inside = path / what if (path / what).is_dir() else path
+            first = next((n.name for n in sorted(inside.iterdir()) if n.name.lower().endswith(suffixes)), "")
+            if what == "archives":
+                way = "Unpack them and give the folder."
+            elif what == "videos":
+                way = f"Of one camera: {_track(_quoted(inside / first))} {RIG}"
+            else:
+                pattern = _quoted(inside / f"*{Path(first).suffix}")
+                join = f"ffmpeg -framerate 25 -pattern_type glob -i {pattern} -c:v libx264 -qp 0 video.mp4"
+                way = f"Frames of one camera: {join}, then {_track('video.mp4')} {RIG}"
             return Foreign(f"a folder of {what}", way)
     return None
+
+
+def _track(video: str) -> str:
+    options = (
+        "--head FLAME2023.pkl --landmarks face_landmark.tflite --segmentation selfie_segmentation.tflite"
+    )
+    return f"headbench track {video} {options} --out capture makes a capture of one person."
 
 
 def _quoted(path: Path) -> str:

@@ -11,12 +11,12 @@ import cv2
 import matplotlib
 import numpy as np
 from matplotlib import style
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ..bench.contracts import ByteArray, FloatArray
+from ..bench.io import figures
 from ..bench.io.images import write_png
 from ..bench.io.provenance import COMPOSITE
 
@@ -27,8 +27,6 @@ TITLE, TEXT, SMALL = 20, 15, 13
 SMALLEST_WIDTH = 760
 """Minimum width for a sheet's text, pixels."""
 DPI = 100
-LONGEST = 2**16 - 1
-"""Maximum side that matplotlib draws, pixels; longer sheets are scaled down."""
 WHITE: ByteArray = np.full((12, 12, 3), 255, np.uint8)
 
 
@@ -78,6 +76,7 @@ class _Paper:
         self, left: float, text: str, size: int, colour: str = INK, *, drop: int = 0, width: int | None = None
     ) -> None:
         """Write one line of text, its top ``drop`` below the current height, truncated to about ``width``."""
+        text = figures.drawable(text)
         limit = len(text) if width is None else _characters(width, size)
         text = text if len(text) <= limit else text[: limit - 1] + "…"
         points = size * 72 / DPI
@@ -110,20 +109,17 @@ class _Paper:
 
     def save(self, path: Path) -> None:
         """Write the page down to the current height as a PNG, atomically."""
-        scale = min(1.0, LONGEST / max(self.width, self.y))
+        scale = min(1.0, figures.LONGEST / max(self.width, self.y))
         self.figure.set_size_inches(self.width / DPI, self.y / DPI)
-        self.figure.set_dpi(scale * DPI)
         self.axes.set(xlim=(0, self.width), ylim=(self.y, 0))
-        canvas = FigureCanvasAgg(self.figure)
-        canvas.draw()
-        pixels = np.array(canvas.buffer_rgba())[..., :3]
+        page = figures.pixels(self.figure)
         for left, top, image in self.images:  # pixel for pixel
             if scale < 1:
                 left, top, height, width = (int(scale * size) for size in (left, top, *image.shape[:2]))
                 size = (max(1, width), max(1, height))
                 image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-            pixels[top : top + image.shape[0], left : left + image.shape[1]] = image
-        write_png(path, np.ascontiguousarray(pixels), COMPOSITE)
+            page[top : top + image.shape[0], left : left + image.shape[1]] = image
+        write_png(path, np.ascontiguousarray(page), COMPOSITE)
 
 
 @style.context("default")  # independent of the user's matplotlibrc, such as text.usetex

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
+from ..bench.io.figures import Canvas
 from ..bench.io.files import atomic_path
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999933")
@@ -46,6 +47,7 @@ def plot_file(
     """
     with style.context(["default", {"text.parse_math": False, "font.size": 10}]):
         figure = Figure(figsize=size, dpi=dpi, layout="constrained")
+        Canvas(figure)
         wrapped = textwrap.fill(note, int(size[0] * CHARACTERS))
         figure.supxlabel(wrapped, x=0.01, ha="left", fontsize=SMALL, color=GREY)
         looks = dict(zip(dict.fromkeys(names), zip(itertools.cycle(COLOURS), itertools.cycle(markers))))

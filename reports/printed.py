@@ -18,15 +18,15 @@ from .writers import column_name
 def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
     """A table with the columns of a published one: measured methods, then the published rows, which are not ranked.
 
-    Values are means over all cameras, as in papers. Methods have the names used in the paper. Raises
-    `InputError` if the runs have no task of the table.
+    Values are means over all cameras, as in papers. Methods have the names used in the paper. Of conditions, those are
+    shown that are a row of the table by their settings alone. Raises `InputError` if the runs have no task of the table.
     """
     metrics = _metrics(runs, printed)
     asked = {key.rpartition("/")[0] for key in printed.keys} - {""}
     tasks = [task for task in TASKS if task in asked and task in runs.tasks]
     if asked and not tasks:
         raise InputError(runs.runs[0].folder.root, "tasks", " or ".join(sorted(asked)), ", ".join(runs.tasks))
-    names = {label: _name(runs.records[label], label, printed) for label in runs.ranked}
+    names = {label: _name(runs.records[label], label, printed) for label in _measured(runs, printed)}
     measured = build_table(
         runs.rows,
         metrics,
@@ -56,6 +56,17 @@ def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
     )
 
 
+def _measured(runs: RunSet, printed: PrintedTable) -> list[str]:
+    """Labels of the ranked methods, and of conditions whose changed settings, and nothing else, make them a row of the table."""
+    known = {c.name: c for run in runs.runs for c in run.manifest.configuration.conditions}
+    chosen = {*runs.ranked}
+    for row in printed.rows:
+        own = {label for label, record in runs.records.items() if row.is_of(record)}
+        if own.isdisjoint(runs.ranked):
+            chosen |= {label for label in own if known[runs.records[label].condition].changes_settings_alone}
+    return [label for label in runs.methods if label in chosen]
+
+
 def _metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
     """The metrics of a published table with its decimals, even if the runs lack them."""
     known = {spec.name: spec for spec in runs.metrics}
@@ -73,7 +84,8 @@ def _metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
 def _name(record: MethodRecord, label: str, printed: PrintedTable) -> str:
     for row in printed.rows:
         if row.method and row.is_of(record):
-            return f"{row.name}{label.removeprefix(record.name)}"
+            condition = f" ({record.condition})" if record.condition else ""
+            return f"{row.name}{condition}{label.removeprefix(record.label)}"
     return label
 
 

@@ -409,10 +409,16 @@ def _subjects(run: RunData, task: str) -> list[str]:
 
 def check_same_protocol(first: RunData, run: RunData, task: str) -> None:
     """Raise `InputError` if two runs score different frames of a task or use different protocols."""
-    expected, found = (one.manifest.protocols[task].hash for one in (first, run))
-    if expected != found:
-        known = f"protocol {expected}, that of {first.folder.root}"
-        raise InputError(run.folder.root, f"protocol of {task}", known, found, "Score the same frames.")
+    one, other = (own.manifest.protocols[task] for own in (first, run))
+    if one.hash != other.hash:
+        known = f"protocol {one.hash}, that of {first.folder.root}"
+        remedy = "Score the same frames."
+        if one.design == other.design:
+            remedy = (
+                "The frames are the same, but the files of the captures differ in content (images, masks, parameters, "
+                "cameras, head model), or the settings of their reader: use one capture for both runs."
+            )
+        raise InputError(run.folder.root, f"protocol of {task}", known, other.hash, remedy)
 
 
 def _metrics(runs: Sequence[RunData]) -> tuple[MetricSpec, ...]:

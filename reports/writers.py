@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..bench import terminal
 from ..bench.io.provenance import tool
-from ..bench.io.style import SHAPES, stylesheet
+from ..bench.io.style import SHAPES, escape_markdown, stylesheet
 from .compact import compact
 from .tables import METHODS_TITLE, TITLES, Column, Table, TableCell
 
@@ -54,11 +54,6 @@ def to_markdown(table: Table) -> str:
 def pipe_table(lines: Iterable[Sequence[str]]) -> str:
     """Lines of cells, the second with the rules, as a pipe table."""
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def escape_markdown(text: str) -> str:
-    """Escape text for Markdown, on one line; an underscore within a word needs no escape."""
-    return re.sub(r"([\\`*{}\[\]<>|#~&]|(?<!\w)_|_(?!\w))", r"\\\1", " ".join(text.split()))
 
 
 def _markdown_cell(cell: TableCell) -> str:
@@ -107,6 +102,8 @@ LATEX_ESCAPES = {
     '"': "''",
     "[": "{[}",
     "]": "{]}",
+    "*": "{*}",  # after the end of a row it would be the star of that command
+    "`": "{`}",  # a question mark before it would be inverted
     "–": "--",
     "—": "---",
     "…": r"\dots{}",
@@ -192,11 +189,14 @@ def to_latex(table: Table) -> str:
 def escape_latex(text: str) -> str:
     """Escape text for LaTeX, on one line; characters that pdfLaTeX's fonts lack become code points."""
 
-    def escaped(character: str) -> str:
-        known = 32 <= ord(character) < 127 or (192 <= ord(character) < 256 and character.isalpha())
-        return LATEX_ESCAPES.get(character, character if known else rf"\texttt{{U+{ord(character):04X}}}")
+    def escaped(match: re.Match[str]) -> str:
+        found = match[0]
+        if len(found) > 1:  # hyphens, which would become a dash
+            return "{}".join(found)
+        known = " " <= found <= "~" or ("À" <= found <= "ÿ" and found.isalpha() and found not in "ÐÞðþ")
+        return LATEX_ESCAPES.get(found, found if known else rf"\texttt{{U+{ord(found):04X}}}")
 
-    return "".join(map(escaped, unicodedata.normalize("NFC", " ".join(text.split()))))
+    return re.sub("--+|.", escaped, unicodedata.normalize("NFC", " ".join(text.split())))
 
 
 def _latex_cell(cell: TableCell) -> str:

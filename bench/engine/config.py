@@ -19,7 +19,7 @@ from ..configuration import build, build_arguments, deciding_settings, merge, se
 from ..contracts import Budget, TaskName
 from ..errors import InputError
 from ..executors.settings import is_speed
-from ..io.files import check_name
+from ..io.files import check_name, check_utf8
 from ..registry import discover, get, resolve, unknown
 from ..source import code_digest, forget_code, is_outside
 from ..specs import ConditionSpec, MethodSpec, MetricSpec, ProfileSpec
@@ -156,7 +156,9 @@ def build_run_config(values: Mapping[str, Any], source: str) -> RunConfig:
                 raise InputError(
                     source, key, "a setting of a run", repr(key), f"Did you mean {places[near[0]]}?"
                 )
-    return build(RunConfig, values, source)
+    config = build(RunConfig, values, source)
+    check_utf8(config.data, source, "data", "a path")
+    return config
 
 
 def _setting_places() -> dict[str, str]:

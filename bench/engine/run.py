@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
@@ -70,8 +71,8 @@ def run(
     execution : Execution, optional
         How to execute the cells. Default: sequentially in this process.
     unchecked : bool
-        Train although a capture has an error that makes results meaningless (see
-        `DatasetSpec.errors`).
+        Do not search the captures for errors that change results (see `DatasetSpec.errors`). A run is
+        continued without a search, too.
     clips : Sequence[Clip], optional
         Captures of the configuration, if they are already open.
     reports : bool
@@ -138,18 +139,23 @@ def _run(
     start = time.perf_counter()
     clips = open_clips(config) if clips is None else clips
     planned, protocols, jobs = _planned(config, cells, metrics, folder, clips)
+    known: set[str] = set()
+    with suppress(InputError):  # of a new run, or of one whose record is damaged
+        earlier = folder.read_manifest()
+        known, unchecked = {clip.fingerprint for clip in earlier.clips}, unchecked or bool(earlier.unchecked)
     if not config.drive:
         warn_of_missing_metrics(metrics, clips[0])
     if not unchecked and not config.source:
         for clip in {job.clip.subject: job.clip for job in jobs if not job.cell.ended("fit")}.values():
-            check_capture(config, clip)
+            if clip.fingerprint not in known:
+                check_capture(config, clip)
 
     forms = tuple(
         AdaptedRecord(**adaptation.record(job.clip, job.adapted, job.label))
         for job in jobs
         if job.adapted is not None and job.seed == config.seeds[0]
     )
-    manifest = replace(planned, adapted=forms, **record)
+    manifest = replace(planned, adapted=forms, unchecked=unchecked or None, **record)
     manifest.write(folder.manifest)
     for reason in {} if config.drive else missing_tasks(config.tasks, protocols).values():
         log.warning("%s", reason)
@@ -366,14 +372,14 @@ def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
 
 
 def check_capture(config: RunConfig, clip: Clip) -> None:
-    """Raise `InputError` for errors of a capture that make every result meaningless, see `DatasetSpec.errors`."""
+    """Raise `InputError` for errors of a capture that change results, see `DatasetSpec.errors`."""
     spec: DatasetSpec = get("datasets", config.reader)
     found = resolve(spec.errors)(clip) if spec.errors else []
     if found:
         raise InputError(
             config.data,
             f"capture of {clip.subject}",
-            "a capture on which avatars can be trained",
+            "a capture without errors that change results",
             " ".join(found).rstrip("."),
             "`headbench lint` shows more; `headbench run --unchecked` trains all the same.",
         )

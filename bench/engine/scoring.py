@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,6 +14,7 @@ import numpy as np
 from ..contracts import ByteArray, Clip, FrameKey, Progress, RegionalClip, no_progress
 from ..errors import HeadbenchError, InputError, LeftOutError, UnavailableError
 from ..io.files import check_name
+from ..machine import processor_count
 from ..registry import resolve
 from ..rows import LEFT_OUT
 from ..specs import MetricSpec
@@ -106,7 +106,7 @@ def score_frames(
     ]
     rest = [spec for spec in specs if spec not in at_once]
     total, done = (bool(at_once) + len(rest)) * len(keys), 0
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(processor_count()) as pool:
         if at_once:
             scorer = partial(_score_frame, frames, [(spec, metrics[spec.name]) for spec in at_once], regions)
             scored.update({spec.name: [] for spec in at_once})

@@ -72,7 +72,8 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
         config = replace(config, tasks=tasks, conditions=tuple(conditions(settings, wanted, clips)))
         refuse_links(out)
         _drop_interrupted(out)
-        run_locked(config, execution, trust=settings.trust, clips=clips, reports=False)
+        unchecked = bool(manifest.unchecked)  # for a run whose captures have errors
+        run_locked(config, execution, trust=settings.trust, clips=clips, reports=False, unchecked=unchecked)
         found: CommandResult = resolve(get("reports", "curve").implementation)(out, settings.over)
         return found
 

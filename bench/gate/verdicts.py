@@ -9,6 +9,7 @@ from typing import Any, Literal
 from xml.etree import ElementTree
 
 from ..errors import ExitCode, shortened
+from ..io.style import escape_markdown
 from .baseline import MACHINE, Baseline, ResultKey, Results, Tolerance
 
 Outcome = Literal["pass", "regressed", "improved", "missing", "new", "unjudged"]
@@ -201,25 +202,25 @@ def to_markdown(verdicts: Sequence[Verdict], code: int, notes: Sequence[str]) ->
         lines += [*_table(others), ""]
     if rest:
         lines += [f"<details><summary>{len(rest)} passed</summary>", "", *_table(rest), "", "</details>", ""]
-    lines += [f"- {_escaped(note)}" for note in notes]
+    lines += [f"- {escape_markdown(note)}" for note in notes]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def to_junit(verdicts: Sequence[Verdict], notes: Sequence[str]) -> str:
     """JUnit XML with a suite for each task: regressed is a failure, missing an error, unjudged skipped."""
-    root = ElementTree.Element("testsuites", name="headbench compare")
+    root = ElementTree.Element("testsuites", name="headbench compare", time="0")
     for task in dict.fromkeys(verdict.place.task for verdict in verdicts):
         own = [verdict for verdict in verdicts if verdict.place.task == task]
         counts = Counter(verdict.outcome for verdict in own)
         numbers = {"tests": len(own), "failures": counts["regressed"]}
-        numbers |= {"errors": counts["missing"], "skipped": counts["unjudged"]}
+        numbers |= {"errors": counts["missing"], "skipped": counts["unjudged"], "time": 0}
         attributes = {"name": _xml(task), **{name: str(number) for name, number in numbers.items()}}
         suite = ElementTree.SubElement(root, "testsuite", attributes)
         for verdict in own:
             place = verdict.place
             name = _xml(f"{place.metric} {place.region} subject {place.subject}")
             case = ElementTree.SubElement(
-                suite, "testcase", classname=_xml(f"{task}.{place.method}"), name=name
+                suite, "testcase", classname=_xml(f"{task}.{place.method}"), name=name, time="0"
             )
             kind = {"regressed": "failure", "missing": "error", "unjudged": "skipped"}.get(verdict.outcome)
             if kind:
@@ -232,15 +233,15 @@ def to_junit(verdicts: Sequence[Verdict], notes: Sequence[str]) -> str:
 
 def failed_markdown(message: str) -> str:
     """The summary for missing or invalid results or baseline."""
-    return f"### Gate: {TITLES[3]}\n\n{_escaped(message)}\n"
+    return f"### Gate: {TITLES[3]}\n\n{escape_markdown(message)}\n"
 
 
 def failed_junit(message: str) -> str:
     """The JUnit XML for missing or invalid results or baseline: one test case, with an error."""
-    root = ElementTree.Element("testsuites", name="headbench compare")
-    counts = {"tests": "1", "failures": "0", "errors": "1", "skipped": "0"}
+    root = ElementTree.Element("testsuites", name="headbench compare", time="0")
+    counts = {"tests": "1", "failures": "0", "errors": "1", "skipped": "0", "time": "0"}
     suite = ElementTree.SubElement(root, "testsuite", {"name": "gate", **counts})
-    case = ElementTree.SubElement(suite, "testcase", classname="gate", name="results and baseline")
+    case = ElementTree.SubElement(suite, "testcase", classname="gate", name="results and baseline", time="0")
     ElementTree.SubElement(case, "error", message=_xml(message))
     return _document(root)
 
@@ -267,15 +268,8 @@ def _table(verdicts: Sequence[Verdict]) -> list[str]:
         numbers = ["" if value is None else format(value, form) for value, form in zip(values, forms)]
         numbers[1] = numbers[1] or verdict.reason
         named = [verdict.outcome, place.task, place.method, place.subject, f"{place.measured}{unit}"]
-        lines.append("| " + " | ".join(_escaped(cell) for cell in [*named, *numbers]) + " |")
+        lines.append("| " + " | ".join(escape_markdown(cell) for cell in [*named, *numbers]) + " |")
     return lines
-
-
-def _escaped(text: str) -> str:
-    """Text that stays in its cell of a Markdown table and is no markup."""
-    for character in "\\|<>*_`[]":
-        text = text.replace(character, f"\\{character}")
-    return " ".join(text.split())
 
 
 def _xml(text: str) -> str:

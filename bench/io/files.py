@@ -144,11 +144,32 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file atomically, keys in the order given, numpy scalars and arrays as numbers and lists.
+    """Write `json_text` of a value atomically.
+
+    Raises `InputError` for a name of a file that is not in UTF-8, which could not be read back.
+    """
+    text = json_text(value)
+    if "\\ud" in text:
+        check_utf8(json.dumps(json.loads(text), ensure_ascii=False), path, "", "names")
+    write_text(path, text)
+
+
+def json_text(value: Any) -> str:
+    """Content of a JSON file, keys in the order given, numpy scalars and arrays as numbers and lists.
 
     Raises `ValueError` for a non-finite number, which JSON cannot represent.
     """
-    write_text(path, json.dumps(value, indent=1, default=to_jsonable, allow_nan=False) + "\n")
+    return json.dumps(value, indent=1, default=to_jsonable, allow_nan=False) + "\n"
+
+
+def check_utf8(text: str, source: str | os.PathLike[str], key: str, what: str) -> None:
+    """Raise `InputError` for text with file names in another encoding, which JSON, Parquet and other libraries do not take."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        found = text[max(0, error.start - 40) : error.end + 40]
+        remedy = "Rename the file or the folder, for example with convmv."
+        raise InputError(source, key, f"{what} in UTF-8", found, remedy) from error
 
 
 def check_writable(path: Path, option: str) -> None:
@@ -238,6 +259,7 @@ def check_room(folder: Path) -> None:
 
 @contextmanager
 def _writable(path: Path, option: str, what: str) -> Iterator[None]:
+    check_utf8(os.path.abspath(path), "command line", option, f"the path of {what}")
     try:
         yield
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have

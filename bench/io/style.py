@@ -1,9 +1,10 @@
-"""The shared style of HTML pages, and its source expression for content security policies."""
+"""The shared style of HTML pages, its source expression for content security policies, and text in Markdown."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from functools import cache
 from pathlib import Path
 
@@ -33,3 +34,8 @@ def stylesheet() -> str:
 def policy_hash(text: str) -> str:
     """Source expression of a script or a style in a content security policy: ``sha256-...``."""
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+def escape_markdown(text: str) -> str:
+    """Escape text for Markdown, on one line; an underscore within a word needs no escape."""
+    return re.sub(r"([\\`*{}\[\]<>|#~&]|(?<!\w)_|_(?!\w))", r"\\\1", " ".join(text.split()))

@@ -34,7 +34,7 @@ from ...bench.io.files import check_name, digest, entries
 from ...bench.io.images import probe_image
 from ..clip import CaptureClip, FrameFiles
 from ..ga.content_digests import digests_below
-from ..ga.layout import DECLARATION_FILE, Declaration, parameter_name
+from ..ga.layout import DECLARATION_FILE, TRACKING_FOLDER, Declaration, parameter_name
 from ..ga.tracking import find_head, read_tracking
 from ..ga.validate import split_by_holding_out
 from ..images import ImageStore
@@ -43,7 +43,6 @@ from ..steps.masks import check_colour
 from ..steps.undistort import Lens, undistort_clip
 from .model import ColmapModel, find_model, read_model
 
-TRACKING_FOLDER = "flame_param"
 SAME_CAMERA = 1e-4
 """Maximum difference between entries of the world-to-camera matrices of one camera, metres."""
 
@@ -144,7 +143,7 @@ def read_dataset(
     exclude, cache_mb, use_cache : Mapping[int, str] | str | Path | None, float, bool
         As for the reader ``ga``.
     """
-    root = Path(os.path.abspath(path))
+    root = Path(os.path.realpath(path))
     model = read_model(root)
     if not (root / TRACKING_FOLDER).is_dir():
         raise InputError(
@@ -171,9 +170,10 @@ def read_dataset(
     splits = split_by_holding_out(root, files, held_out_sequences, held_out_cameras)
     if not splits["train"]:
         raise InputError(root, "splits", "training frames left", "none left")
-    used = {*timesteps.values(), *model.files}
+    used = {*timesteps.values()}
     used |= {file for frame in files.values() for file in (frame.image, frame.mask) if file is not None}
     contents = digests_below(root, used, use_cache=use_cache, progress=progress)
+    contents["model"] = digest(sorted(model.cameras.items()), sorted(model.images.items()))
     declared = declaration.background if declaration else (1.0, 1.0, 1.0)
     ground = check_colour(declared if background is None else background)
     source = digest(tracking.head.fingerprint(), contents, subject, ground)

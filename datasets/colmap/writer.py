@@ -24,7 +24,7 @@ from ..head.subject import PosedSubject
 from ..images import write_image
 from ..mesh_pictures import rasterize_mesh
 from .model import pycolmap
-from .reader import TRACKING_FOLDER, frame_key
+from .reader import frame_key
 
 ModelFormat = Literal["bin", "txt"]
 Naming = Literal["nested", "flat"]
@@ -131,7 +131,7 @@ def export_tracking(clip: CaptureClip, timesteps: Collection[int], out: Path) ->
     """Write the additional files of the reader ``colmap``: parameters by timestep, head model, conventions."""
     identity = identity_parameters(clip.shape, clip.static_offset)
     for timestep in sorted(timesteps):
-        path = out / TRACKING_FOLDER / layout.parameter_name(timestep)
+        path = out / layout.TRACKING_FOLDER / layout.parameter_name(timestep)
         save_npz(path, pose_to_parameters(clip.poses[timestep]) | identity)
     save_head(out / layout.HEAD_FILE, clip.head)
     red, green, blue = clip.background.tolist()

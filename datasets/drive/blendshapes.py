@@ -2,12 +2,30 @@
 
 FLAME has no such shapes. They are applied to a head that has them, the embedded one or one with ARKit's expression
 names such as ICT-FaceKit's, and its vertices are transferred to the avatar's head.
+
+Formats read:
+
+- Live Link Face CSV. Written by Epic Games' Live Link Face for iPhone, and like it by AnimaVR/NeuroSync_Player
+  (`utils/csv/save_csv.py`). Checked on alexdjulin/LiveLinkFace-CSV-Retarget-For-Motionbuilder@6492a4a1 `anim/alex_rom_3.csv`
+  and AnimaVR/NeuroSync_Player@f31b8fad `livelink/animations/Sad/MySlate_167_iPhone_cal.csv`.
+- MediaPipe Face Landmarker results, JavaScript. Written by google-ai-edge/mediapipe
+  (`mediapipe/tasks/web/vision/face_landmarker`). Checked on UUoocl/UUhimsy@80429b75 `UUhimsy_Demo_Vault/_GUM/README.md`.
+- MediaPipe Face Landmarker results, Python and Unity. Written by google-ai-edge/mediapipe
+  (`mediapipe/tasks/python/vision/face_landmarker.py`) and homuler/MediaPipeUnityPlugin. Not checked on a file of the program.
+- Audio2Face-3D CSV. Written by NVIDIA/Audio2Face-3D-Samples
+  (`scripts/audio2face_3d_api_client/a2f_3d/client/service.py`). Checked on walkoncross/NIM-audio2face-visualization@e563d13b
+  `viz-threejs/assets/animation_frames.csv`.
+- Audio2Face JSON. Written by NVIDIA Omniverse Audio2Face. Not checked on a file of the program.
+- LAM JSON. Written by aigc3d/LAM_Audio2Expression (`models/utils.py`). Checked on aigc3d/LAM_WebRender@12174e94
+  `asset/test_expression_1s.json`.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
+from difflib import get_close_matches
 from functools import cache
 
 import numpy as np
@@ -20,6 +38,7 @@ from ..head.procedural.model import procedural_head
 from ..head.procedural.versions import VERSIONS, semantic_to_coefficients
 from .signal import POSE_PARTS, DrivingSignal, SignalRequest, make_poses
 from .table import SignalTable
+from .timing import Timing
 
 JAW_OPEN = 0.44
 """Radians of the jaw at jawOpen 1: the hinge that explains the shape of that name of ICT-FaceKit."""
@@ -86,16 +105,15 @@ _EMBEDDED = {
 ARKIT = tuple(sorted({*JOINTS, *_EMBEDDED, *NOT_DRIVEN}))
 """The 52 names."""
 
-_OTHER_COLUMNS = re.compile(
-    r"(head|(left|right)eye)(yaw|pitch|roll)|time.*|frame.*|blendshapecount|_neutral", re.IGNORECASE
-)
-"""Other columns of the exports of MediaPipe and of Live Link Face."""
+MISSPELT = 0.85
+"""Similarity to one of ARKit's names from which a column is taken for it, misspelt."""
+_SPELLINGS = {name.lower(): name for name in ARKIT}
 
 
 def arkit_name(name: str) -> str:
-    """ARKit's name of a column, whose first letter may be a capital; "" for others."""
-    lower = name[:1].lower() + name[1:]
-    return lower if lower in ARKIT else ""
+    """ARKit's name of a column, in any case, also after a dot, or with ``_L`` and ``_R`` for Left and Right; "" for others."""
+    sided = re.sub("_L$", "Left", re.sub("_R$", "Right", name.rpartition(".")[2]))
+    return _SPELLINGS.get(sided.replace("_", "").lower(), "")
 
 
 def is_blendshapes(table: SignalTable) -> bool:
@@ -104,17 +122,17 @@ def is_blendshapes(table: SignalTable) -> bool:
 
 
 def read_blendshapes(request: SignalRequest) -> DrivingSignal:
-    """Blendshapes of each frame. Raises `InputError` for an unknown column, and for values beyond `RANGE`."""
-    table = request.columns
-    known = {name: arkit_name(name) for name in table.columns}
+    """Blendshapes of each frame with a face. Raises `InputError` for a misspelt column, and for values beyond `RANGE`."""
+    known = {name: arkit_name(name) for name in request.columns.columns}
+    table = request.columns.with_face([name for name, arkit in known.items() if arkit])
     unused = {}
     for name in table.columns:
-        if not known[name]:
-            if not _OTHER_COLUMNS.fullmatch(name):
-                expected = "ARKit's names of blendshapes, and times"
-                raise InputError(
-                    table.path, "columns", expected, repr(name), "Use a map of columns: --map FILE.yaml."
-                )
+        if not known[name] and name != table.timing.column:
+            similar = get_close_matches(name.lower(), [*_SPELLINGS], 1, MISSPELT)
+            if similar:
+                expected = f"ARKit's name {_SPELLINGS[similar[0]]}"
+                remedy = "Use a map of columns: --map FILE.yaml."
+                raise InputError(table.path, "columns", expected, repr(name), remedy)
             unused[name] = "no blendshape"
     channels: dict[str, FloatArray] = {}
     for name, arkit in known.items():
@@ -128,11 +146,13 @@ def read_blendshapes(request: SignalRequest) -> DrivingSignal:
         if np.abs(values).max() > RANGE:
             expected = f"values of blendshapes, from {-RANGE:g} to {RANGE:g}"
             raise InputError(table.path, name, expected, f"{values[np.abs(values).argmax()]:g}")
-    signal = apply_blendshapes(request, channels)
-    return DrivingSignal(signal.form, signal.head, signal.poses, {**unused, **signal.unused})
+    signal = apply_blendshapes(request, channels, table.timing)
+    return replace(signal, unused={**unused, **signal.unused})
 
 
-def apply_blendshapes(request: SignalRequest, channels: Mapping[str, FloatArray]) -> DrivingSignal:
+def apply_blendshapes(
+    request: SignalRequest, channels: Mapping[str, FloatArray], timing: Timing
+) -> DrivingSignal:
     """Poses of the head that performs the blendshapes: the one given, else the embedded one.
 
     Parameters
@@ -157,7 +177,7 @@ def apply_blendshapes(request: SignalRequest, channels: Mapping[str, FloatArray]
         for part, direction in parts.get(name, {}).items():
             columns[part] += values[:, None] * direction
     columns["jaw"][:, 0] = np.maximum(columns["jaw"][:, 0], 0.0)
-    return DrivingSignal("blendshapes", head, make_poses(request.path, head, columns), unused)
+    return DrivingSignal("blendshapes", head, make_poses(request.path, head, columns), timing, unused)
 
 
 def is_embedded(head: HeadArrays) -> bool:
@@ -221,10 +241,8 @@ def _named_columns(head: HeadArrays) -> dict[str, FloatArray]:
     """(E,) directions by ARKit's name of the head's named expressions; ``_L`` and ``_R`` stand for Left and Right."""
     found: dict[str, FloatArray] = {}
     for name, column in zip(head.expression_names, np.eye(len(head.expression_names))):
-        stem = re.sub("_([LR])$", "", name)
-        side = {"_L": "Left", "_R": "Right"}.get(name[len(stem) :], "")
-        for arkit in (stem + side, stem):  # browInnerUp is one shape in ARKit and a pair in others
-            if arkit_name(arkit):
-                found[arkit_name(arkit)] = found.get(arkit_name(arkit), 0.0) + column
-                break
+        # browInnerUp is one shape in ARKit and a pair in others
+        arkit = arkit_name(name) or arkit_name(re.sub("_[LR]$", "", name))
+        if arkit:
+            found[arkit] = found.get(arkit, 0.0) + column
     return found

@@ -44,8 +44,10 @@ from ..video.decode import SUFFIXES
 from .formats import read_signal
 from .settings import DriveSettings
 from .signal import DrivingSignal, SignalRequest
-from .transfer import Transferred, head_motion, smoothed, transfer, window_length
+from .transfer import Transferred, head_motion, resampled, smoothed, transfer, window_length
 
+FPS = 25.0
+"""Frames per second where neither the signal nor an option states them."""
 SEQUENCE = "drive"
 """Name of the driven sequence in captures."""
 
@@ -315,13 +317,16 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
             progress=progress,
         )
         signal = read_signal(request, settings.form)
-        window_length(len(signal.poses), settings.smooth, settings.fps)
+        fps = settings.fps or signal.timing.fps or FPS
+        regular, filled = resampled(request.path, signal.poses, signal.timing, fps)
+        signal = replace(signal, poses=regular)
+        window_length(len(signal.poses), settings.smooth, fps)
         found = transfer(signal, scene.head, settings.neutral, progress)
         moving = head_motion(found.poses, settings.still_head)
-        driven = smoothed(moving, settings.smooth, settings.fps)
+        driven = smoothed(moving, settings.smooth, fps)
         transfer_ms = 1e3 * (time.perf_counter() - start) / len(driven)
         data = measured(settings, scene, signal, found, (moving, driven))
-        data["transfer_ms"] = round(transfer_ms, 2)
+        data |= {"fps": fps, "interpolated": filled, "transfer_ms": round(transfer_ms, 2)}
         poses = dict(enumerate(scene.placed([*driven, canonical(scene.head)])))
         sequences = dict.fromkeys(poses, SEQUENCE) | {len(driven): REST}
         if is_video:
@@ -335,7 +340,7 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
         renderer = Renderer(avatar, clip, form, progress)
         written = out
         if is_video:
-            write_driven_video(out, renderer, clip, settings.fps)
+            write_driven_video(out, renderer, clip, fps)
         else:
             written = write_driven_capture(out, renderer, clip)
         data |= {
@@ -366,6 +371,7 @@ def measured(
         "signal": settings.signal,
         "format": signal.form,
         "frames": len(after),
+        "signal_fps": signal.timing.fps,
         "head_models": [signal.head.version, scene.head.version],
         "refit_residual_mm": _rounded(found.residual_mm),
         "jitter_mm": {
@@ -392,10 +398,14 @@ def report_text(data: dict[str, Any]) -> str:
     """Text of the measures for a terminal."""
     source, target = data["head_models"]
     jitter, spill, lips = data["jitter_mm"], data["spill_mm"], data["lips_mm"]
-    residual = data["refit_residual_mm"]
+    residual, stated, filled = data["refit_residual_mm"], data["signal_fps"], data["interpolated"]
+    rate = f"{data['fps']:g} frames a second"
+    if stated != data["fps"]:
+        rate += ", as the signal states none" if stated is None else f", resampled from {stated:g}"
     fitted = "coefficients as they are" if residual is None else f"refit, {residual:.3f} mm on the face"
     lines = [
         f"{data['written']}: {data['frames']} frames of {data['signal']} ({data['format']})",
+        f"  rate            {rate}",
         f"  head models     {source} to {target}: {fitted}",
         "  jitter          "
         + (
@@ -412,6 +422,11 @@ def report_text(data: dict[str, Any]) -> str:
         ),
         f"  latency         {data['transfer_ms']:.1f} ms a frame to read and transfer, {data['render_ms']:.1f} ms to render",
     ]
+    if filled:
+        count = sum(last - first + 1 for first, last in filled)
+        shown = ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last in filled)
+        what = f"{count} of {data['frames']} frames, without a face or missing in the signal"
+        lines.insert(2, f"  interpolated    {what}: {shown}")
     reasons: dict[str, list[str]] = {}
     for channel, reason in data["unused"].items():
         reasons.setdefault(reason, []).append(channel)

@@ -1,4 +1,17 @@
-"""Formats of driving signals: how each is recognised and read, with mapped columns and coefficients of a head model."""
+"""Formats of driving signals: how each is recognised and read, with mapped columns and coefficients of a head model.
+
+Formats read:
+
+- EMOCA folders. Written by radekd91/emoca 2.0 (`gdl_apps/EMOCA/utils/io.py`). Not checked on a file of the program.
+- INFERNO folders. Written by radekd91/inferno (`inferno_apps/FaceReconstruction/utils/output.py`). Not checked on a file of
+  the program.
+- DECA coefficients. Written by users from the result of yfeng95/DECA (`decalib/deca.py`, `encode`) or filby89/spectre
+  (`src/spectre.py`, `encode`). Not checked on a file of the program.
+- SMIRK coefficients. Written by users from the result of georgeretsi/smirk (`src/smirk_encoder.py`). Not checked on a file of
+  the program.
+- SHeaP coefficients. Written by users from the result of nlml/sheap. Not checked on a file of the program.
+- VHAP parameters. Written by ShenhanQian/VHAP (`vhap/export_as_nerf_dataset.py`). Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +33,8 @@ from ..head.arrays import HeadArrays
 from .blendshapes import ARKIT, apply_blendshapes, is_blendshapes, read_blendshapes
 from .names import IDENTITY, NAMES
 from .signal import AVATAR, NO_EYELIDS, POSE_PARTS, DrivingSignal, SignalRequest, make_poses
-from .table import SignalTable, natural_order, read_table
+from .table import SignalTable, read_table
+from .timing import Timing, in_order
 
 TRACKED_HEAD = "flame2023"
 """Head model of VHAP."""
@@ -44,17 +58,18 @@ def read_flame_parameters(request: SignalRequest) -> DrivingSignal:
     declaration = Declaration.read(path.parent) if path.is_dir() and not request.signal_head else None
     head = find_head(path.parent, declaration, None) if declaration else request.head(TRACKED_HEAD)
     if path.is_dir():
-        files = dict(enumerate(sorted(path.glob("*.npz"), key=natural_order)))
+        files, timing = in_order([*path.glob("*.npz")])
         if not files:
             raise InputError(path, "", "a .npz file of parameters for each frame", "none")
-        tracking = read_tracking(files, head, "")
+        tracking = read_tracking(dict(enumerate(files)), head, "")
     else:
         tracking = read_animation(path, head)
+        timing = request.columns.timing
     poses = [tracking.poses[timestep] for timestep in sorted(tracking.poses)]
     unused = {**IDENTITY_UNUSED, **{k: v for k, v in tracking.notes.items() if k == "eyelids"}}
     if tracking.notes.get("dynamic_offset_ignored_m"):
         unused["dynamic_offset"] = "offsets of vertices"
-    return DrivingSignal("flame_param", tracking.head, poses, unused)
+    return DrivingSignal("flame_param", tracking.head, poses, timing, unused)
 
 
 def read_capture_signal(request: SignalRequest) -> DrivingSignal:
@@ -81,11 +96,12 @@ def read_capture_signal(request: SignalRequest) -> DrivingSignal:
     ]
     if not timesteps:
         raise InputError(request.path, request.sequence, "frames that are not excluded", "none")
-    return DrivingSignal("capture", clip.head, [clip.poses[t] for t in timesteps], IDENTITY_UNUSED)
+    poses = [clip.poses[t] for t in timesteps]
+    return DrivingSignal("capture", clip.head, poses, Timing.of_numbers(timesteps), IDENTITY_UNUSED)
 
 
 DEFAULT_HEAD = "flame2020"
-"""Head model of all four."""
+"""Head model of all five."""
 
 
 def is_coefficients(table: SignalTable) -> bool:
@@ -94,10 +110,11 @@ def is_coefficients(table: SignalTable) -> bool:
 
 
 def read_coefficients(request: SignalRequest) -> DrivingSignal:
-    """Coefficients of each frame. Identity is ignored."""
+    """Coefficients of each frame with a face. Identity is ignored."""
     table = request.columns
     head = request.head(DEFAULT_HEAD)
     found = {part: next((n for n in names if n in table.columns), "") for part, names in NAMES.items()}
+    table = table.with_face([name for name in found.values() if name])
     if not found["expression"]:
         expected = f"expression coefficients: {', '.join(NAMES['expression'])}"
         raise InputError(table.path, "", expected, ", ".join(sorted(table.columns)))
@@ -108,11 +125,11 @@ def read_coefficients(request: SignalRequest) -> DrivingSignal:
     unused = {
         name: "identity" if name in IDENTITY else "no coefficient of the pose"
         for name in table.columns
-        if name not in used
+        if name not in (*used, table.timing.column)
     }
     if "eyelids" in parts and head.eyelid_basis is None:
         unused[found["eyelids"]] = NO_EYELIDS
-    return DrivingSignal("coefficients", head, make_poses(table.path, head, parts), unused)
+    return DrivingSignal("coefficients", head, make_poses(table.path, head, parts), table.timing, unused)
 
 
 def _parts(
@@ -160,7 +177,9 @@ def read_mapped(request: SignalRequest) -> DrivingSignal:
             raise InputError(source, column, "{column: {coefficient: weight}}", "an empty map")
         if column not in table.columns:
             raise unknown(str(source), "columns", column, [*table.columns])
-    unused = dict.fromkeys((name for name in table.columns if name not in weights), "not in the map")
+    table = table.with_face([*weights])
+    without = (*weights, table.timing.column)
+    unused = dict.fromkeys((name for name in table.columns if name not in without), "not in the map")
     values = {column: table.single(column) for column in weights}
     targets = {name for entry in weights.values() for name in entry}
     blendshapes = targets & {*ARKIT}
@@ -172,12 +191,11 @@ def read_mapped(request: SignalRequest) -> DrivingSignal:
         for name, weight in entry.items():
             sums[name] += weight * values[column]
     if blendshapes:
-        signal = apply_blendshapes(request, sums)
-        return DrivingSignal("mapped", signal.head, signal.poses, {**unused, **signal.unused})
+        signal = apply_blendshapes(request, sums, table.timing)
+        return replace(signal, form="mapped", unused={**unused, **signal.unused})
     head = request.head()
-    return DrivingSignal(
-        "mapped", head, make_poses(table.path, head, _coefficients(source, head, sums)), unused
-    )
+    poses = make_poses(table.path, head, _coefficients(source, head, sums))
+    return DrivingSignal("mapped", head, poses, table.timing, unused)
 
 
 def _coefficients(source: Path, head: HeadArrays, sums: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -228,9 +246,14 @@ FORMATS = (
         read_flame_parameters,
     ),
     SignalFormat(
-        "coefficients", "FLAME coefficients of DECA, EMOCA, SMIRK, SHeaP", is_coefficients, read_coefficients
+        "coefficients",
+        "FLAME coefficients of DECA, EMOCA, INFERNO, SMIRK, SHeaP",
+        is_coefficients,
+        read_coefficients,
     ),
-    SignalFormat("blendshapes", "52 blendshapes of ARKit or MediaPipe", is_blendshapes, read_blendshapes),
+    SignalFormat(
+        "blendshapes", "52 blendshapes of ARKit, MediaPipe, Audio2Face", is_blendshapes, read_blendshapes
+    ),
     SignalFormat(
         "capture", "a capture in a layout that a reader knows", lambda table: False, read_capture_signal
     ),

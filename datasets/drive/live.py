@@ -11,6 +11,7 @@ from ..head.arrays import HeadArrays
 from .formats import read_rows
 from .signal import SignalRequest
 from .table import SignalTable, parse_line
+from .timing import Timing
 from .transfer import FrameTransfer
 
 
@@ -45,9 +46,10 @@ class LiveDriver:
         """
         path = Path("live signal")
         frame = parse_line(line, path, "line")
-        table = SignalTable(path, {name: [value] for name, value in frame.items()}, ["line"])
         if not frame:
-            raise InputError(path, "line", "values of a frame", "an empty object")
+            raise InputError(path, "line", "values of a frame with a face", "none")
+        columns = {name: [value] for name, value in frame.items()}
+        table = SignalTable(path, columns, ["line"], Timing.regular(1))
         signal = read_rows(SignalRequest(path, self._target, table, self._signal_head))
         version = signal.head.version
         if version not in self._transfer:

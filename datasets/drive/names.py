@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 NAMES: Mapping[str, tuple[str, ...]] = {
     "expression": ("expression", "expression_params", "exp", "expcode", "expr"),
-    "jaw": ("jaw", "jaw_pose", "jaw_params"),
-    "rotation": ("rotation", "pose_params", "torso_pose", "global_pose"),
+    "jaw": ("jaw", "jaw_pose", "jaw_params", "jawpose"),
+    "rotation": ("rotation", "pose_params", "torso_pose", "global_pose", "globalpose"),
     "neck": ("neck", "neck_pose"),
     "eyes": ("eyes", "eyes_pose", "eye_pose"),
     "left_eye": ("eye_l_pose",),

@@ -21,7 +21,7 @@ class DriveSettings(CaptureOptions):
     avatar: AvatarFolder
 
     signal: str
-    """File or folder of the signal: FLAME coefficients (npz, JSON), 52 blendshapes (CSV, JSON lines), a folder of FLAME
+    """File or folder of the signal: FLAME coefficients (npz, JSON), 52 blendshapes (CSV, JSON), a folder of FLAME
     parameters, a capture, or any table with --map."""
 
     out: str
@@ -50,14 +50,15 @@ class DriveSettings(CaptureOptions):
     size: int = 512
     """Without --capture: width and height of the image, pixels."""
 
-    fps: float = 25.0
-    """Frames per second of the signal and of the video."""
+    fps: float | None = None
+    """Frames per second of the result. Default: those of the signal's times, else 25. A signal with times is resampled; one
+    without has these."""
 
     smooth: float = 0.0
     """Window of a Savitzky-Golay filter of order 2, seconds; 0 leaves the signal as it is."""
 
     neutral: int | None = None
-    """Frame of the signal, from 0, that shows the neutral face: its expression is subtracted from all frames."""
+    """Frame, from 0, that shows the neutral face: its expression is subtracted from all frames."""
 
     still_head: bool = False
     """Leave out rotation and translation of the head."""
@@ -74,7 +75,7 @@ class DriveSettings(CaptureOptions):
     )
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.fps <= 1000.0:
+        if self.fps is not None and not 0.0 < self.fps <= 1000.0:
             raise ValueError(f"fps is {self.fps}; above 0, at most 1000")
         if not 0.0 <= self.smooth <= 60.0:
             raise ValueError(f"smooth is {self.smooth}; from 0 to 60 seconds")

@@ -15,6 +15,7 @@ from ..head.arrays import HeadArrays
 from ..head.refit.command import target_head
 from ..options import CaptureOptions
 from .table import SignalTable
+from .timing import Timing
 
 POSE_PARTS = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
 """Parts of a pose beside expression and eyelids, and their numbers."""
@@ -36,6 +37,8 @@ class DrivingSignal:
         Head model of its poses.
     poses : Sequence[HeadPose]
         One for each frame, at least one.
+    timing : Timing
+        Times of the poses.
     unused : Mapping[str, str]
         Channels of the signal that drive nothing, each with the reason.
     """
@@ -43,6 +46,7 @@ class DrivingSignal:
     form: str
     head: HeadArrays
     poses: Sequence[HeadPose]
+    timing: Timing
     unused: Mapping[str, str] = field(default_factory=dict)
 
 

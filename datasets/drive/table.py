@@ -1,13 +1,15 @@
-"""Tables of values over time: CSV, JSON, JSON lines, npz, and folders with one file per frame."""
+"""Tables of values over time: CSV, JSON, JSON lines, npz, and folders with one file per frame.
+
+A table has a row for each frame of the file. Rows without a face have empty values, and `SignalTable.with_face` leaves them out.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +20,23 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy, read_npz
 from ...bench.io.documents import parse_json, read_json, read_text, shown
 from ...bench.io.files import reading, user_files
+from ..foreign import describe
 from .names import IDENTITY, NAMES
+from .timing import Timing, from_columns, in_order
 
 _CATEGORY_NAMES, _SCORE = ("categoryName", "category_name"), "score"
-"""Keys of MediaPipe's categories in its JavaScript and its Python."""
+"""Keys of MediaPipe's categories in its JavaScript, Java and C#, and in its Python."""
+_CATEGORIES = "categories"
+"""Key of the list of a face's categories, in all but Python."""
+_FACES = ("faceblendshapes", "face_blendshapes", "blendshapes")
+"""Keys, in lower case, of the faces of a frame; empty in a frame without one."""
+_COUNT, _SUCCESS = "blendshapecount", "success"
+"""Columns that are 0 in a row without a face, in lower case: of Live Link Face, whose row ends there, and of OpenFace."""
+
+_NAMES, _WEIGHTS = ("facsNames", "names"), ("weightMat", "weights")
+"""Keys of the names of blendshapes and of their values, of Audio2Face in a document and of LAM in each frame."""
+_RATES = ("exportFps", "fps", "frame_rate", "frameRate")
+"""Keys of the frames per second, in a document or its metadata."""
 
 _FRAMES = "frames"
 """Key of a JSON document with a list of frames."""
@@ -39,14 +54,39 @@ class SignalTable:
         T values by name: numbers, text, lists of numbers, or an array (T, ...).
     places : Sequence[str]
         Location of each of the T frames in the file, such as "line 7".
+    timing : Timing
+        Times of the T frames.
     """
 
     path: Path
     columns: Mapping[str, Sequence[Any] | np.ndarray]
     places: Sequence[str]
+    timing: Timing
 
     def __len__(self) -> int:
         return len(self.places)
+
+    def with_face(self, names: Sequence[str]) -> SignalTable:
+        """The rows with a value in any of the columns ``names``, and without ``success`` 0; all of them if that is none."""
+        columns = [self.columns[name] for name in names]
+        tracked = [column for name, column in self.columns.items() if name.lower() == _SUCCESS]
+        if any(len(column) != len(self) for column in self.columns.values()):
+            return self
+        rows = [
+            not all(_is_empty(column[row]) for column in columns)
+            and not any(str(column[row]).strip() in ("0", "0.0", "False") for column in tracked)
+            for row in range(len(self))
+        ]
+        if all(rows) or not any(rows):
+            return self
+        kept = [row for row, face in enumerate(rows) if face]
+        chosen = {
+            name: column[kept] if isinstance(column, np.ndarray) else [column[row] for row in kept]
+            for name, column in self.columns.items()
+        }
+        return replace(
+            self, columns=chosen, places=[self.places[row] for row in kept], timing=self.timing.where(rows)
+        )
 
     def values(self, name: str) -> FloatArray:
         """(T, n) float64 values of a column; n is 1 for single numbers.
@@ -94,49 +134,72 @@ class SignalTable:
             return [float(item) for item in items]
         except (ValueError, OverflowError):
             expected = "a number" if isinstance(value, str) else "a number or a list of numbers"
-            raise InputError(self.path, f"{name}, {place}", expected, shown(value)) from None
+            found = "none" if value is None else shown(value)
+            raise InputError(self.path, f"{name}, {place}", expected, found) from None
+
+
+def _is_empty(value: Any) -> bool:
+    """Whether a value is none: null, an empty list or text, or NaN throughout."""
+    if isinstance(value, (np.ndarray, np.floating)):
+        return value.dtype.kind == "f" and bool(np.isnan(value).all())
+    return value is None or value == [] or (isinstance(value, str) and value.strip().lower() in ("", "nan"))
 
 
 def read_table(path: Path) -> SignalTable:
-    """Read a file by its ending, or a folder with files of each frame.
+    """Read a file by its ending, or a folder with files of each frame. Times are those of a column, if there are any.
 
     Raises `InputError` for another ending, a damaged or empty file, and frames with unequal columns.
     """
-    if path.is_dir():
-        return _folder(path)
-    read = _READERS.get(path.suffix.lower())
+    read = _folder if path.is_dir() else _READERS.get(path.suffix.lower())
     if read is None:
         expected = f"a file in {', '.join(_READERS)}, or a folder"
-        remedy = "" if path.exists() else "There is no such file."
-        raise InputError(path, "", expected, repr(path.suffix), remedy)
+        raise InputError(path, "", expected, *describe(path))
     table = read(path)
     if not len(table) or not table.columns:
         raise InputError(path, "", "at least one frame with values", "none")
-    return table
+    timing = from_columns(path, dict(table.columns), table.places)
+    return table if timing is None else replace(table, timing=timing)
 
 
 def parse_line(text: str, path: Path, place: str) -> dict[str, Any]:
     """Columns of one line of JSON; MediaPipe's lists of categories become one column each."""
-    return _expanded(parse_json(text, path, place))
+    return _expanded(parse_json(text, path, place), path, place)
 
 
-def _expanded(frame: Mapping[str, Any]) -> dict[str, Any]:
-    """Columns of a frame, with one for each of MediaPipe's categories."""
+def _expanded(frame: Mapping[str, Any], path: Path, place: str, names: Sequence[str] = ()) -> dict[str, Any]:
+    """Columns of a frame, also of objects in it, with one for each of MediaPipe's categories or of the ``names`` of weights.
+
+    Raises `InputError` for two faces.
+    """
     line: dict[str, Any] = {}
     for name, value in frame.items():
-        categories = _categories(value)
-        line |= {name: value} if categories is None else categories
+        faces = value if isinstance(value, list) else [value]
+        if faces and isinstance(faces[0], dict) and not isinstance(faces[0].get(_CATEGORIES), list):
+            faces = [faces]  # the categories of one face
+        scores = [_categories(face) for face in faces]
+        if isinstance(value, dict) and scores[0] is None:
+            line |= _expanded(value, path, place)
+        elif name in _WEIGHTS and names and isinstance(value, list) and len(value) == len(names):
+            line |= zip(names, value)
+        elif scores and scores[0] is not None:
+            if len(scores) > 1:
+                remedy = "Track one face, or keep the entry of one."
+                raise InputError(path, f"{place}, {name}", "one face a frame", f"{len(scores)}", remedy)
+            line |= scores[0]
+        elif value or name.lower() not in _FACES:
+            line[name] = value
     return line
 
 
-def _categories(value: Any) -> dict[str, Any] | None:
-    """Scores by name, if the value is MediaPipe's list of categories, of one face or a list with one face."""
-    while isinstance(value, list) and len(value) == 1 and isinstance(value[0], list):
-        value = value[0]
-    if not isinstance(value, list) or not value or not all(isinstance(item, dict) for item in value):
+def _categories(face: Any) -> dict[str, Any] | None:
+    """Scores by name, if the value is MediaPipe's list of categories of a face, or has one."""
+    while isinstance(face, list) and len(face) == 1 and isinstance(face[0], list):
+        face = face[0]
+    items = face.get(_CATEGORIES) if isinstance(face, dict) else face
+    if not isinstance(items, list) or not items or not all(isinstance(item, dict) for item in items):
         return None
     found = {}
-    for item in value:
+    for item in items:
         names = [item[key] for key in _CATEGORY_NAMES if isinstance(item.get(key), str)]
         if not names or _SCORE not in item:
             return None
@@ -152,15 +215,19 @@ def _csv(path: Path) -> SignalTable:
     if not rows:
         raise InputError(path, "", "a header and a line for each frame", "an empty file")
     names = [name.strip() for name in rows[0][1]]
+    names[0] = names[0] or "index"  # of pandas
     for name in names:
         if not name or names.count(name) > 1:
             raise InputError(path, "header", "distinct names of columns", repr(name))
+    count = next((index for index, name in enumerate(names) if name.lower() == _COUNT), None)
     for number, row in rows[1:]:
+        if count is not None and [cell.strip() for cell in row[count : count + 1]] == ["0"]:
+            row[count + 1 :] = [""] * (len(names) - count - 1)
         if len(row) != len(names):
             expected = f"{len(names)} values, as the header has names"
             raise InputError(path, f"line {number}", expected, str(len(row)))
     columns = {name: [row[index] for _, row in rows[1:]] for index, name in enumerate(names)}
-    return SignalTable(path, columns, [f"line {number}" for number, _ in rows[1:]])
+    return _table(path, columns, [f"line {number}" for number, _ in rows[1:]])
 
 
 def _json_lines(path: Path) -> SignalTable:
@@ -172,23 +239,47 @@ def _json_lines(path: Path) -> SignalTable:
 
 
 def _json(path: Path) -> SignalTable:
-    document = read_json(path)
-    frames = document.get(_FRAMES)
+    text = read_text(path, "JSON")
+    document = parse_json(f'{{"{_FRAMES}": {text}}}' if text.lstrip().startswith("[") else text, path)
+    frames, names = document.get(_FRAMES), _named(document, _NAMES, list) or []
+    fps = _rate(document) or _rate(_named(document, ("metadata",), dict) or {})
     if isinstance(frames, list):
         for number, frame in enumerate(frames):
             if not isinstance(frame, dict):
                 raise InputError(path, f"{_FRAMES}[{number}]", "an object", shown(frame))
         places = [f"{_FRAMES}[{number}]" for number in range(len(frames))]
-        return _joined(path, places, [_expanded(frame) for frame in frames])
+        rows = [_expanded(frame, path, place, names) for frame, place in zip(frames, places)]
+        return _joined(path, places, rows, fps=fps)
     columns = {name: value for name, value in document.items() if isinstance(value, list)}
-    return _columns(path, columns)
+    weights = _named(document, _WEIGHTS, list)
+    if names and weights and all(isinstance(row, list) and len(row) == len(names) for row in weights):
+        columns = {name: value for name, value in columns.items() if value not in (names, weights)}
+        columns |= {name: list(values) for name, values in zip(names, zip(*weights))}
+    return _columns(path, columns, fps)
+
+
+def _named(document: Mapping[str, Any], keys: Sequence[str], kind: type) -> Any:
+    """The first entry under one of the keys that is of a kind; None without one."""
+    return next((document[key] for key in keys if isinstance(document.get(key), kind)), None)
+
+
+def _rate(document: Mapping[str, Any]) -> float | None:
+    """Frames per second that a document states."""
+    found = [
+        float(document[key]) for key in _RATES if isinstance(document.get(key), (int, float, np.ndarray))
+    ]
+    return next((fps for fps in found if fps > 0), None)
 
 
 def _npz(path: Path) -> SignalTable:
-    return _columns(path, {name: values for name, values in read_npz(path).items() if values.ndim})
+    arrays = read_npz(path)
+    scalars = {
+        name: values for name, values in arrays.items() if values.size == 1 and values.dtype.kind in "fiu"
+    }
+    return _columns(path, {name: values for name, values in arrays.items() if values.ndim}, _rate(scalars))
 
 
-def _columns(path: Path, columns: Mapping[str, Any]) -> SignalTable:
+def _columns(path: Path, columns: Mapping[str, Any], fps: float | None = None) -> SignalTable:
     """A table of whole columns: a row of an array, or a number, for each frame. Vectors of coefficients alone are one frame."""
     moving = {name: values for name, values in columns.items() if name not in IDENTITY and len(values)}
     rows = {
@@ -197,42 +288,44 @@ def _columns(path: Path, columns: Mapping[str, Any]) -> SignalTable:
         if isinstance(values[0], list) or (isinstance(values[0], np.ndarray) and values[0].ndim)
     }
     if not rows and any(name in moving for name in NAMES["expression"]):
-        return SignalTable(path, {name: [values] for name, values in moving.items()}, ["frame 0"])
+        return _table(path, {name: [values] for name, values in moving.items()}, ["frame 0"])
     length = max(map(len, (rows or moving).values()), default=0)
-    return SignalTable(path, columns, [f"frame {number}" for number in range(length)])
+    return _table(path, columns, [f"frame {number}" for number in range(length)], fps)
 
 
-def _joined(path: Path, places: Sequence[str], frames: Sequence[Mapping[str, Any]]) -> SignalTable:
-    """A table of frames, all with the columns of the first."""
-    names = list(frames[0]) if frames else []
-    for place, frame in zip(places, frames):
-        if set(frame) != set(names):
-            other = min(set(frame) ^ set(names))
-            found = "a new one" if other in frame else "none"
-            raise InputError(path, f"{place}, {other}", f"the columns of {places[0]}", found)
-    return SignalTable(path, {name: [frame[name] for frame in frames] for name in names}, places)
+def _table(
+    path: Path, columns: Mapping[str, Any], places: Sequence[str], fps: float | None = None
+) -> SignalTable:
+    """A table of consecutive frames."""
+    return SignalTable(path, columns, places, Timing.regular(len(places), fps))
+
+
+def _joined(
+    path: Path, places: Sequence[str], frames: Sequence[Mapping[str, Any]], fps: float | None = None
+) -> SignalTable:
+    """A table of consecutive frames with the columns of all; None where a frame lacks one."""
+    names = dict.fromkeys(name for frame in frames for name in frame)
+    return _table(path, {name: [frame.get(name) for frame in frames] for name in names}, places, fps)
 
 
 def _folder(path: Path) -> SignalTable:
     """A folder of files, each a frame; of folders, each a frame with an npy file for each array; or of npy files of all frames."""
-    folders = sorted((p for p in path.iterdir() if p.is_dir() and any(p.glob("*.npy"))), key=natural_order)
-    if folders:
-        frames = [{file.stem: read_npy(file) for file in user_files(p, "*.npy")} for p in folders]
-        return _joined(path, [folder.name for folder in folders], frames)
-    arrays = {file.stem: read_npy(file) for file in user_files(path, "*.npy")}
-    if arrays:
-        return _columns(path, arrays)
-    readers: dict[str, Callable[[Path], Mapping[str, Any]]] = {"*.npz": read_npz, "*.json": read_json}
-    for pattern, read in readers.items():
-        files = sorted(user_files(path, pattern), key=natural_order)
-        if files:
-            return _joined(path, [file.name for file in files], [read(file) for file in files])
-    raise InputError(path, "", "files npz, npy or json of a signal's frames, or a capture", "none")
-
-
-def natural_order(path: Path) -> list[tuple[bool, int | str]]:
-    """Key that sorts names by their numbers: 2 before 10."""
-    return [(part.isdigit(), int(part) if part.isdigit() else part) for part in re.split(r"(\d+)", path.stem)]
+    folders = [*dict.fromkeys(file.parent for file in user_files(path, "*/*.npy"))]
+    files = user_files(path, "*.npy")
+    if files and not folders:
+        return _columns(path, {file.stem: read_npy(file) for file in files})
+    sources: Sequence[tuple[Sequence[Path], Callable[[Path], Mapping[str, Any]]]] = (
+        (folders, lambda folder: {file.stem: read_npy(file) for file in user_files(folder, "*.npy")}),
+        (user_files(path, "*.npz"), read_npz),
+        (user_files(path, "*.json"), lambda file: _expanded(read_json(file), file, "")),
+    )
+    for found, read in sources:
+        if found:
+            ordered, timing = in_order(found)
+            table = _joined(path, [place.name for place in ordered], [read(place) for place in ordered])
+            return replace(table, timing=timing)
+    expected = "files npz, npy or json of a signal's frames, or a capture"
+    raise InputError(path, "", expected, *describe(path))
 
 
 _READERS: Mapping[str, Callable[[Path], SignalTable]] = {

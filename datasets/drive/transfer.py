@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +22,12 @@ from ..head.rotations import rotation_of
 from ..head.subject import PosedSubject, resting
 from ..head.teeth import with_teeth_where_possible
 from .signal import NO_EYELIDS, DrivingSignal
+from .timing import GAP, Timing
 
 SMOOTHED = ("expression", "jaw", "eyes", "eyelids", "neck", "rotation", "translation")
 KEEP_NECK = RefitSettings(neck="keep")
+ROUNDED = 0.1
+"""Frames by which the time of the last frame may be too early."""
 ORDER = 2
 """Order of the polynomials of the Savitzky-Golay filter."""
 
@@ -153,6 +157,49 @@ def head_motion(poses: Sequence[HeadPose], still: bool) -> list[HeadPose]:
         return [replace(p, rotation=np.zeros(3), neck=np.zeros(3), translation=np.zeros(3)) for p in poses]
     mean = RigidMean.of(poses)
     return [retarget(pose, mean, AT_ORIGIN, pose.subject) for pose in poses]
+
+
+def resampled(
+    path: Path, poses: Sequence[HeadPose], timing: Timing, fps: float
+) -> tuple[list[HeadPose], list[tuple[int, int]]]:
+    """Poses at ``fps``, and the first and last number of each series of them that no frame of the signal is near to.
+
+    Between two frames poses are interpolated linearly, head rotations on the shortest path; before the first and after the last
+    they are held. Signals that state no rate have ``fps``. Raises `InputError` for a signal without half of its frames.
+    """
+    positions, total = timing.positions, round(timing.last) + 1
+    if 2 * len(positions) < total:
+        steps = np.diff(positions, append=timing.last)
+        longest = int(positions[steps.argmax()]) + 1
+        expected = f"a face in half of its {total} frames or more"
+        found = (
+            f"{len(positions)}; the most are missing from frame {longest}, {round(steps.max() - 1)} of them"
+        )
+        raise InputError(path, timing.column, expected, found, "Keep a part of the signal without long gaps.")
+    step = (timing.fps or fps) / fps
+    times = step * np.arange(int(timing.last / step + ROUNDED) + 1)
+    after = np.searchsorted(positions, times).clip(1, max(1, len(positions) - 1)) % len(positions)
+    before = np.maximum(after - 1, 0)
+    nearest = np.minimum(abs(times - positions[before]), abs(times - positions[after]))
+    if len(times) == len(poses) and nearest.max() < 1e-6:
+        return list(poses), []
+    share = (times - positions[before]) / np.maximum(positions[after] - positions[before], 1e-9)
+    share = share.clip(0, 1)[:, None]
+    columns = {}
+    for name in SMOOTHED:
+        values = [getattr(pose, name) for pose in poses]
+        if values[0] is not None:
+            array = np.array(values, np.float64)
+            columns[name] = (1 - share) * array[before] + share * array[after]
+    rotations = rotation_of(np.array([pose.rotation for pose in poses]))
+    turns = (rotations[before].inv() * rotations[after]).as_rotvec()
+    columns["rotation"] = (rotations[before] * rotation_of(share * turns)).as_rotvec()
+    made = [
+        replace(poses[row], **{name: values[number] for name, values in columns.items()})
+        for number, row in enumerate(before)
+    ]
+    filled = np.flatnonzero(np.diff(nearest > GAP / 2, prepend=False, append=False)).reshape(-1, 2)
+    return made, [(int(first), int(end) - 1) for first, end in filled]
 
 
 def window_length(frames: int, seconds: float, fps: float) -> int:

@@ -17,10 +17,11 @@ VHAP measures ``cy`` from the bottom edge since its commit 34afb35 (November 202
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,7 +30,7 @@ import numpy as np
 from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.documents import checked, read_json, shown
-from ...bench.io.files import check_name, with_slashes, write_json
+from ...bench.io.files import check_name, json_text, with_slashes, write_json
 from ..rounding import ANGLE_BITS, on_grid
 
 CyConvention = Literal["top", "bottom", "centre"]
@@ -43,6 +44,7 @@ SPLIT_FILES = {
 }
 ALL_FRAMES_FILE = "transforms.json"
 CANONICAL_FILE = "canonical_flame_param.npz"
+TRACKING_FOLDER = "flame_param"
 DECLARATION_FILE = "headbench.json"
 HEAD_FILE = "head_model.npz"
 TRAIN_SEQUENCES_FILE = "sequences_trainval.txt"
@@ -162,9 +164,22 @@ class Declaration:
 
     def write(self, folder: Path) -> None:
         """Write ``headbench.json`` into ``folder``."""
+        write_json(folder / DECLARATION_FILE, self._content())
+
+    def digest(self, sequences: Iterable[str]) -> str:
+        """Digest of the file that `write` makes, with ``sequences`` in the order given."""
+        names = sorted(self.sequences, key=[*sequences, *self.sequences].index)
+        settings = sorted(self.synthetic, key=[*_SYNTHETIC, *sorted(self.synthetic)].index)
+        ordered = replace(
+            self,
+            sequences={name: self.sequences[name] for name in names},
+            synthetic={name: self.synthetic[name] for name in settings},
+        )
+        return hashlib.sha256(json_text(ordered._content()).encode()).hexdigest()
+
+    def _content(self) -> dict[str, Any]:
         excluded = [{"timestep": t, "reason": reason} for t, reason in sorted(self.excluded.items())]
-        value = {"format_version": FORMAT_VERSION, **vars(self), "excluded": excluded}
-        write_json(folder / DECLARATION_FILE, value)
+        return {"format_version": FORMAT_VERSION, **vars(self), "excluded": excluded}
 
     @classmethod
     def read(cls, folder: Path) -> Declaration | None:
@@ -187,6 +202,14 @@ class Declaration:
         values |= {"excluded": {entry.timestep: entry.reason for entry in file.excluded}}
         del values["format_version"]
         return cls(**values)
+
+
+_SYNTHETIC = (
+    *("subjects", "cameras", "timesteps", "size", "head", "seed", "tracking_noise", "samples_per_pixel"),
+    *("performance", "dynamics", "tracking_error", "tracker", "hair_lag", "camera_colour", "motion_blur"),
+    *("mask_error", "correctives", "edition", "style"),
+)
+"""Keys of `Declaration.synthetic` in the order in which `headbench synth` writes them."""
 
 
 @dataclass(frozen=True)

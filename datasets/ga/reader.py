@@ -131,11 +131,14 @@ def read_capture(
         splits = split_by_holding_out(folder, frames, held_out_sequences, held_out_cameras)
     # All files of the clip except the head model, which may be elsewhere and has its own digest.
     used = {file for e in everything for file in (e.file, e.image, e.mask, e.parameters) if file is not None}
-    used |= {folder / layout.DECLARATION_FILE} if declaration else set()
     images = {
         FrameKey(subject, names[e.sequence_folder], e.timestep, e.camera_id): e.image for e in everything
     }
     contents = digests_below(folder, used, use_cache=use_cache, progress=progress)
+    if declaration:
+        ordered = sorted(everything, key=lambda e: e.timestep)
+        folders = dict.fromkeys(e.sequence_folder for e in ordered)
+        contents[layout.DECLARATION_FILE] = declaration.digest(folders)
     found = find_leaks(splits, images, progress=progress)
     record = {
         "cy": convention,
@@ -181,7 +184,7 @@ def find_captures(root: Path) -> list[Path]:
     if not root.exists():
         raise InputError(root, "", expected, "no such folder")
     if any((root / file).exists() for file in (*layout.SPLIT_FILES.values(), layout.ALL_FRAMES_FILE)):
-        if (root / "flame" / "exp").is_dir() and not (root / "flame_param").is_dir():
+        if (root / "flame" / "exp").is_dir() and not (root / layout.TRACKING_FOLDER).is_dir():
             raise InputError(
                 root, "", expected, "a capture of INSTA, whose JSONs have the same names", MONOCULAR
             )
@@ -194,7 +197,7 @@ def find_captures(root: Path) -> list[Path]:
 
 def find_capture(path: str | Path) -> Path:
     """The only capture at ``path``. Raises `InputError` if there is none or several."""
-    folder = Path(os.path.abspath(path))  # "." has no name for a subject
+    folder = Path(os.path.realpath(path))  # neither "." nor a link names a subject or sequence
     captures = find_captures(folder)
     if len(captures) != 1:
         found = ", ".join(capture.name for capture in captures)

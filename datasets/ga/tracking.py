@@ -1,4 +1,11 @@
-"""Head model and tracked parameters of a capture: ``flame_param`` files to poses, identity and static offset."""
+"""Head model and tracked parameters of a capture: ``flame_param`` files to poses, identity and static offset.
+
+Formats read:
+
+- FLAME parameters of GaussianAvatars, `flame_param/*.npz` and `flame_param.npz`. Written by
+  ShenhanQian/VHAP@4b64ab7d (`vhap/export_as_nerf_dataset.py`) and by ShenhanQian/GaussianAvatars@30cc4bde
+  (`scene/flame_gaussian_model.py`). Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 

@@ -1,12 +1,19 @@
-"""Read a transforms JSON into validated frame entries; errors name file and frame."""
+"""Read a transforms JSON into validated frame entries; errors name file and frame.
+
+Formats read:
+
+- Transforms JSON of GaussianAvatars. Written by ShenhanQian/VHAP@4b64ab7d (`vhap/export_as_nerf_dataset.py`,
+  `vhap/combine_nerf_datasets.py`). Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -16,6 +23,7 @@ from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import check_name, with_slashes
 from ..foreign import IMAGES, frame_route
+from .layout import TRACKING_FOLDER
 
 INTRINSIC_KEYS = ("cx", "cy", "fl_x", "fl_y", "camera_angle_x")
 RIGID_TOLERANCE = 1e-4
@@ -27,9 +35,9 @@ _IDENTITY, _LAST_ROW = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
 class FrameEntry:
     """One frame of a transforms JSON with resolved paths and checked types.
 
-    ``where`` is the JSON's path to the entry ("frames[17]"), for error messages. ``intrinsics`` has those of
-    `INTRINSIC_KEYS` that the frame or the document states. ``width`` and ``height`` are None if the JSON does not
-    state them.
+    ``where`` is the JSON's path to the entry ("frames[17]"), for error messages. ``sequence_folder`` is the name of the
+    folder that holds the parameters' folder, however the JSON leads there. ``intrinsics`` has those of `INTRINSIC_KEYS`
+    that the frame or the document states. ``width`` and ``height`` are None if the JSON does not state them.
     """
 
     file: Path
@@ -118,11 +126,11 @@ def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any])
     way = frame_route(frame)
     if way:
         raise InputError(path, f"{where}.flame_param_path", "text", "no such key", way)
-    image = with_slashes(reader.text("file_path"))
-    if Path(image).suffix.lower() not in IMAGES:
-        image += ".png"  # as GaussianAvatars does
-    mask = with_slashes(reader.text("fg_mask_path")) if "fg_mask_path" in frame else None
-    camera_index = reader.integer("camera_index") if "camera_index" in frame else 0
+    image = reader.path("file_path")
+    if image.suffix.lower() not in IMAGES:
+        image = Path(f"{image}.png")  # as GaussianAvatars does
+    parameters = reader.path("flame_param_path")
+    camera_index = reader.integer("camera_index") if reader.has("camera_index") else 0
     intrinsics = {key: reader.number(key) for key in INTRINSIC_KEYS if reader.has(key)}
     _check_intrinsics(path, where, intrinsics)
     return FrameEntry(
@@ -130,11 +138,13 @@ def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any])
         where=where,
         timestep=reader.integer("timestep_index"),
         camera_index=camera_index,
-        camera_id=reader.name("camera_id") if "camera_id" in frame else f"{camera_index:02d}",
-        sequence_folder=check_name(_sequence_folder(path.parent, image), path, f"{where}.file_path"),
-        image=path.parent / image,
-        mask=path.parent / mask if mask else None,
-        parameters=path.parent / with_slashes(reader.text("flame_param_path")),
+        camera_id=reader.name("camera_id") if reader.has("camera_id") else f"{camera_index:02d}",
+        sequence_folder=check_name(
+            _sequence_folder(path.parent, image, parameters), path, f"{where}.flame_param_path"
+        ),
+        image=image,
+        mask=reader.path("fg_mask_path") if reader.has("fg_mask_path") else None,
+        parameters=parameters,
         width=reader.integer("w") if reader.has("w") else None,
         height=reader.integer("h") if reader.has("h") else None,
         intrinsics=intrinsics,
@@ -154,10 +164,13 @@ def _check_intrinsics(path: Path, where: str, intrinsics: Mapping[str, float]) -
         raise InputError(path, f"{where}.camera_angle_x", "an angle in (0, pi) radians", f"{angle}")
 
 
-def _sequence_folder(folder: Path, image: str) -> str:
-    """Folder of ``images/``: the sequence's own, also if a union refers to it."""
-    parts = Path(image).parts
-    return parts[1] if len(parts) > 2 and parts[0] == ".." else folder.name
+def _sequence_folder(folder: Path, image: Path, parameters: Path) -> str:
+    """Name of the folder of the sequence's files: of ``flame_param``, else the innermost of image and parameters."""
+    folder, image, parameters = (Path(os.path.abspath(path)) for path in (folder, image, parameters))
+    if parameters.parent.name == TRACKING_FOLDER:
+        return parameters.parent.parent.name
+    shared = Path(os.path.commonpath([image, parameters]))
+    return folder.name if folder.is_relative_to(shared) else shared.name
 
 
 class _FrameReader:
@@ -167,13 +180,14 @@ class _FrameReader:
         self._path, self._where, self._frame, self._document = path, where, frame, document
 
     def has(self, key: str) -> bool:
-        return key in self._frame or key in self._document
+        return self._get(key) is not None
 
     def _fail(self, key: str, expected: str) -> InputError:
         return InputError(self._path, f"{self._where}.{key}", expected, found_entry(self._get(key)))
 
     def _get(self, key: str) -> Any:
-        return self._frame.get(key, self._document.get(key))
+        own = self._frame.get(key)
+        return self._document.get(key) if own is None else own
 
     def text(self, key: str) -> str:
         value = self._frame.get(key)
@@ -181,25 +195,36 @@ class _FrameReader:
             raise self._fail(key, "text")
         return value
 
+    def path(self, key: str) -> Path:
+        text = self.text(key)
+        root = "/" if PureWindowsPath(text).drive else ""  # C:/images is absolute here, too
+        return self._path.parent / (root + with_slashes(text))
+
     def name(self, key: str) -> str:
-        return check_name(self.text(key), self._path, f"{self._where}.{key}")
+        """Text, or a whole number in place of it."""
+        value = self._get(key)
+        text = value if isinstance(value, str) and value else str(self.integer(key))
+        return check_name(text, self._path, f"{self._where}.{key}")
 
     def integer(self, key: str) -> int:
-        value = self._get(key)
-        whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
-        if isinstance(value, bool) or not whole or not 0 <= value < MAX_INTEGER:
+        value = _number(self._get(key))
+        if not (value.is_integer() and 0 <= value < MAX_INTEGER):
             raise self._fail(key, f"an integer from 0 to {MAX_INTEGER - 1}")
         return int(value)
 
     def number(self, key: str) -> float:
-        value = self._get(key)
-        number = math.nan
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
-            with suppress(OverflowError):  # JSON integers have no bound
-                number = float(value)
-        if not math.isfinite(number):
+        value = _number(self._get(key))
+        if not math.isfinite(value):
             raise self._fail(key, "a finite number")
-        return number
+        return value
+
+
+def _number(value: Any) -> float:
+    """A JSON number; NaN for anything else."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        with suppress(OverflowError):  # JSON integers have no bound
+            return float(value)
+    return math.nan
 
 
 def read_matrix(file: Path, key: str, value: Any, size: int) -> FloatArray:

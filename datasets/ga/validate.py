@@ -6,7 +6,7 @@ Each fault is an `InputError` with file, entry, expected and found value.
 from __future__ import annotations
 
 import os
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -17,7 +17,7 @@ from ...bench.errors import InputError
 from ...bench.io.images import ImageInfo, probe_image
 from ...bench.progress import counted
 from ..clip import CaptureClip
-from .content_digests import content_digests
+from .content_digests import digests_of_same_size
 from .layout import parse_sequence_folder
 from .transforms import FrameEntry, timesteps_of
 
@@ -84,7 +84,8 @@ def check_timesteps(folder: Path, entries: Sequence[FrameEntry]) -> None:
     first: dict[int, FrameEntry] = {}
     for entry in entries:
         other = first.setdefault(entry.timestep, entry)
-        if (entry.parameters, entry.sequence_folder) != (other.parameters, other.sequence_folder):
+        one, two = (os.path.abspath(e.parameters) for e in (entry, other))
+        if (one, entry.sequence_folder) != (two, other.sequence_folder):
             raise InputError(
                 entry.file,
                 f"{entry.where}.flame_param_path",
@@ -105,19 +106,16 @@ def find_leaks(
     novel-view cameras among the training cameras. Contents are read at each call, but only for images with the same
     file size as one of another split.
     """
-    sizes = {images[key]: images[key].stat().st_size for keys in splits.values() for key in keys}
-    split_of_size: dict[int, set[str]] = defaultdict(set)
-    for split, keys in splits.items():
-        for key in keys:
-            split_of_size[sizes[images[key]]].add(split)
-    alike = [path for path, size in sizes.items() if len(split_of_size[size]) > 1]
-    contents = content_digests(alike, progress=progress)
+    parts = {split: [images[key] for key in keys] for split, keys in splits.items()}
+    contents = digests_of_same_size(parts, progress=progress)
     found = []
     for one, other in combinations(splits, 2):
         names = f"{one} and {other}"
         shared = sorted({images[key] for key in splits[one]} & {images[key] for key in splits[other]})
         if shared:
-            found.append(f"{len(shared)} image files are in both {names}, such as {shared[0]}")
+            found.append(
+                f"{len(shared)} image files are in both {names}, such as {'/'.join(shared[0].parts[-3:])}"
+            )
             continue
         by_content = {contents[images[key]]: key for key in splits[one] if images[key] in contents}
         equal = [key for key in splits[other] if contents.get(images[key]) in by_content]

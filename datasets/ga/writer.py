@@ -7,6 +7,7 @@ and writes parameters and JSONs, those of the union last, so a folder with a uni
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,7 +41,7 @@ def file_record(timestep: int, camera_index: int, *, mask: bool) -> dict[str, st
     """Paths of a frame's files, relative to the sequence's folder."""
     name = layout.frame_name(timestep, camera_index)
     masks = {"fg_mask_path": f"fg_masks/{name}.png"} if mask else {}
-    parameters = f"flame_param/{layout.parameter_name(timestep)}"
+    parameters = f"{layout.TRACKING_FOLDER}/{layout.parameter_name(timestep)}"
     return {"file_path": f"images/{name}.png", **masks, "flame_param_path": parameters}
 
 
@@ -100,14 +101,19 @@ def write_union(
         shared = {
             k: v for k, v in document.items() if k not in ("frames", "timestep_indices", "camera_indices")
         }
-        for entry, frame in zip(read_transforms(path), document["frames"], strict=True):
+        entries = read_transforms(path)
+        for entry, frame in zip(entries, document["frames"], strict=True):
             record = {key: value for key, value in frame.items() if key not in _SINGLE_SEQUENCE_KEYS}
-            tested = folder in test or frame["timestep_index"] in partly.get(folder, ())
-            record["timestep_index"] += start
-            for key in _PATH_KEYS & record.keys():
-                record[key] = f"../{folder.name}/{record[key]}"
+            tested = folder in test or entry.timestep in partly.get(folder, ())
+            record |= {"timestep_index": start + entry.timestep, "camera_index": entry.camera_index}
+            paths = {
+                "file_path": entry.image,
+                "fg_mask_path": entry.mask,
+                "flame_param_path": entry.parameters,
+            }
+            record |= {key: Path(os.path.relpath(p, union)).as_posix() for key, p in paths.items() if p}
             placed.append((record, tested, entry.camera_id in held_out))
-        start += 1 + max((frame["timestep_index"] for frame in document["frames"]), default=-1)
+        start += 1 + max((entry.timestep for entry in entries), default=-1)
     for file, group in ((layout.TRAIN_SEQUENCES_FILE, train), (layout.TEST_SEQUENCES_FILE, test)):
         write_text(union / file, "".join(f"{folder.name}\n" for folder in group))
     write_bytes(union / layout.CANONICAL_FILE, (train[0] / layout.CANONICAL_FILE).read_bytes())
@@ -116,7 +122,6 @@ def write_union(
     return _write_splits(union, placed, shared)
 
 
-_PATH_KEYS = {"file_path", "fg_mask_path", "flame_param_path"}
 _SINGLE_SEQUENCE_KEYS = ("timestep_index_original", "timestep_id")
 
 
@@ -309,7 +314,7 @@ class CaptureWriter:
         plan, folder = self.plan, self.sequence_folder(sequence.name)
         identity = identity_parameters(plan.shape, plan.static_offset)
         for timestep, pose in enumerate(sequence.poses):
-            path = folder / "flame_param" / layout.parameter_name(timestep)
+            path = folder / layout.TRACKING_FOLDER / layout.parameter_name(timestep)
             save_npz(path, pose_to_parameters(pose) | identity)
         zeros = {k: np.zeros_like(v) for k, v in pose_to_parameters(plan.sequences[0].poses[0]).items()}
         zeros["jaw_pose"] = np.array([CANONICAL_JAW], dtype=np.float64)

@@ -13,9 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, IntArray, Progress, no_progress
+from ...bench.io.figures import pixels
 from ...bench.protocol import evenly_with_ends
 from ..clip import CaptureClip
-from ..figures import HELD_OUT, MUTED, TRAIN, bands, hexadecimal, new_figure, pixels, shortened, show
+from ..figures import HELD_OUT, MUTED, TRAIN, bands, hexadecimal, new_figure, shortened, show
 from ..head.geometry import rigid_alignment
 from ..head.subject import PosedSubject
 from ..mesh_pictures import draw_mesh, rasterize_mesh

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
+from typing import cast
 
 import numpy as np
 
-from ...bench.contracts import FloatArray
+from ...bench.contracts import ByteArray, FloatArray
 from ...bench.progress import counted
 from ..ga import layout
 from ..ga.cameras import ROTATION_TOLERANCE, contradicted_focal, same_intrinsics
 from ..ga.principal_point import OutlineView, weigh_cy
 from ..ga.transforms import FrameEntry
-from ..images import read_mask
 from .checks_images import sound_mask
 from .evidence import Evidence, first_entries
 from .rules import Hit, at, rule, some
@@ -40,7 +40,7 @@ EXACT = 1e-4
 """Pixels; a principal point this close to (w - 1) / 2 is assumed to be computed as such."""
 
 
-@rule("HB501", "error", of_layout=True)
+@rule("HB501", "error", of_layout=True, refused=True)
 def _not_rigid(evidence: Evidence) -> Iterator[Hit]:
     """A camera's matrix is not a rigid motion.
 
@@ -177,7 +177,7 @@ def _contradicted(evidence: Evidence) -> list[tuple[str, FrameEntry, float]]:
     return wrong
 
 
-@rule("HB506", "error", of_layout=True)
+@rule("HB506", "error", of_layout=True, refused=True)
 def _focal(evidence: Evidence) -> Iterator[Hit]:
     """Focal length and angle of view disagree.
 
@@ -280,13 +280,14 @@ def _ignored(evidence: Evidence) -> Iterator[Hit]:
 def cy_evidence_views(evidence: Evidence) -> list[OutlineView]:
     """Views for comparing outlines, with cameras whose cy is measured from the top."""
     views = []
+    mask = cast("Callable[[FrameEntry], ByteArray]", evidence.pixels.mask)  # of frames that have one
     for view in evidence.views:
-        mesh, path = view.mesh, view.entry.mask or view.entry.image
+        mesh = view.mesh
         if mesh is None or mesh.depth <= 0 or not sound_mask(view) or "cy" not in view.entry.intrinsics:
             continue
         K = mesh.camera.K.copy()
         K[:2, 2] = view.entry.intrinsics.get("cx", 0), view.entry.intrinsics["cy"]
-        views.append(OutlineView(mesh.vertices, replace(mesh.camera, K=K), partial(read_mask, path)))
+        views.append(OutlineView(mesh.vertices, replace(mesh.camera, K=K), partial(mask, view.entry)))
     return views
 
 

@@ -35,7 +35,7 @@ def _faults(errors: Iterable[InputError], noun: str) -> Iterator[Hit]:
         yield Hit(f"expected {expected}, found {first.found}{more}", first.file, first.key)
 
 
-@rule("HB100", "error", of_layout=True)
+@rule("HB100", "error", of_layout=True, refused=True)
 def _refused(evidence: Evidence) -> Iterator[Hit]:
     """The reader refuses the capture.
 
@@ -51,7 +51,7 @@ def _refused(evidence: Evidence) -> Iterator[Hit]:
         yield Hit(f"{text}. {error.remedy}" if error.remedy else text, error.file, error.key)
 
 
-@rule("HB101", "error", of_layout=True)
+@rule("HB101", "error", of_layout=True, refused=True)
 def _broken_json(evidence: Evidence) -> Iterator[Hit]:
     """A JSON of the capture is missing or broken.
 
@@ -60,7 +60,7 @@ def _broken_json(evidence: Evidence) -> Iterator[Hit]:
     yield from _faults((*evidence.json_faults, *evidence.declaration_faults), "file")
 
 
-@rule("HB102", "error", of_layout=True)
+@rule("HB102", "error", of_layout=True, refused=True)
 def _broken_frame(evidence: Evidence) -> Iterator[Hit]:
     """A frame's entry is incomplete or of the wrong kind.
 
@@ -109,7 +109,7 @@ def _absolute_elsewhere(evidence: Evidence) -> dict[str, tuple[FrameEntry, str]]
     return found
 
 
-@rule("HB116", "error", of_layout=True)
+@rule("HB116", "error", of_layout=True, refused=True)
 def _absolute_paths(evidence: Evidence) -> Iterator[Hit]:
     """Paths are absolute and of another machine.
 
@@ -125,7 +125,7 @@ def _absolute_paths(evidence: Evidence) -> Iterator[Hit]:
         )
 
 
-@rule("HB104", "error", of_layout=True)
+@rule("HB104", "error", of_layout=True, refused=True)
 def _wrong_size(evidence: Evidence) -> Iterator[Hit]:
     """An image or mask has another size than stated.
 
@@ -170,7 +170,7 @@ def _holes(evidence: Evidence) -> Iterator[Hit]:
             yield Hit(text, evidence.folder, "frames")
 
 
-@rule("HB106", "error", of_layout=True)
+@rule("HB106", "error", of_layout=True, refused=True)
 def _gap(evidence: Evidence) -> Iterator[Hit]:
     """Timesteps are not numbered from 0 without a gap.
 
@@ -204,7 +204,7 @@ def _frozen(evidence: Evidence) -> Iterator[Hit]:
         yield Hit(text, evidence.folder, "timestep_index")
 
 
-@rule("HB108", "error", of_layout=True)
+@rule("HB108", "error", of_layout=True, refused=True)
 def _stray_exclusion(evidence: Evidence) -> Iterator[Hit]:
     """An exclusion names a timestep that does not exist.
 

@@ -29,6 +29,9 @@ FRINGES = (0.65, 1.5)
 
 BLANK_COVERAGE = 0.001
 
+MASK_LEVELS = (12, 240)
+"""Maximum level of what is outside a mask, and minimum level of what is inside."""
+
 LIMITED_LOW, LIMITED_HIGH = (14, 24), (231, 237)
 """Expected range of the minimum and maximum level of limited-range images; resizing softens the ends a
 little."""
@@ -45,12 +48,13 @@ def _masks(evidence: Evidence) -> list[tuple[ViewFacts, MaskFacts]]:
     return [(v, v.mask) for v in evidence.views if v.mask is not None and v.entry.camera_id not in blank]
 
 
-def _unit_mask(mask: MaskFacts) -> bool:
-    return mask.high == 1
+def _other_levels(mask: MaskFacts) -> bool:
+    """Whether nothing is covered fully, or everything a little."""
+    return 0 < mask.high < MASK_LEVELS[1] or MASK_LEVELS[0] < mask.low <= 127
 
 
 def _empty(mask: MaskFacts) -> bool:
-    return mask.coverage < BLANK_COVERAGE and not _unit_mask(mask)
+    return mask.coverage < BLANK_COVERAGE and not _other_levels(mask)
 
 
 def _full(mask: MaskFacts) -> bool:
@@ -62,7 +66,7 @@ def _inverted(mask: MaskFacts) -> bool:
 
 
 def _sound(mask: MaskFacts) -> bool:
-    return not (_unit_mask(mask) or _empty(mask) or _full(mask) or _inverted(mask))
+    return not (_other_levels(mask) or _empty(mask) or _full(mask) or _inverted(mask))
 
 
 def sound_mask(view: ViewFacts) -> bool:
@@ -78,12 +82,16 @@ def _faulty_masks(evidence: Evidence, is_faulty: Callable[[MaskFacts], bool], wh
 
 
 @rule("HB307", "error")
-def _unit_masks(evidence: Evidence) -> Iterator[Hit]:
-    """A mask has values 0 and 1 instead of 255.
+def _mask_levels(evidence: Evidence) -> Iterator[Hit]:
+    """A mask has other levels than 0 to 255.
 
-    Multiply it by 255 before saving.
+    Scale it before saving: masks of 0 and 1 by 255, of video's limited range from 16 and 235.
     """
-    yield from _faulty_masks(evidence, _unit_mask, "the mask has only the values 0 and 1 out of 255,")
+    found = [mask for _, mask in _masks(evidence) if _other_levels(mask)]
+    if found:
+        low, high = min(mask.low for mask in found), max(mask.high for mask in found)
+        what = f"the mask's levels lie from {low} to {high}, not from 0 to 255,"
+        yield from _faulty_masks(evidence, _other_levels, what)
 
 
 @rule("HB304", "error")
@@ -172,7 +180,7 @@ def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
     """
     if unit_range(evidence) or limited_range(evidence):
         return
-    seen = outside_colours(evidence)
+    seen = [found for found in outside_colours(evidence) if not _shows_room(found[0])]
     wrong = [(view, colour) for view, colour, _ in seen if _foreign(evidence, colour)]
     if wrong:
         found = np.median([colour for _, colour in wrong], axis=0).round().astype(int)
@@ -183,6 +191,26 @@ def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
             f"declared background is level {tuple(stated.tolist())}, outside the subject there is {shown} in "
             f"{len(wrong)} of {counted(len(seen), 'frame')} checked",
             wrong[0][0].entry.image,
+        )
+
+
+def _shows_room(view: ViewFacts) -> bool:
+    """Whether a frame without a mask shows something behind the subject."""
+    return view.mask is None and view.room
+
+
+@rule("HB309", "warning")
+def _room(evidence: Evidence) -> Iterator[Hit]:
+    """The room is seen behind the subject.
+
+    Make masks, unless the room is to count in every metric: avatars have no room.
+    """
+    seen = outside_colours(evidence)
+    rooms = [view for view, colour, _ in seen if _shows_room(view) and _foreign(evidence, colour)]
+    if rooms:
+        yield Hit(
+            f"{len(rooms)} of {counted(len(seen), 'frame')} checked have no mask and no background of one colour",
+            rooms[0].entry.image,
         )
 
 

@@ -43,7 +43,7 @@ UNTRAINED = 0.25
 CHANGE = 1e-4
 
 
-@rule("HB601", "error", of_layout=True)
+@rule("HB601", "error", of_layout=True, refused=True)
 def _version(evidence: Evidence) -> Iterator[Hit]:
     """The head model differs from the one used for tracking.
 
@@ -65,7 +65,11 @@ def _sequence_versions(evidence: Evidence) -> Iterator[Hit]:
 
     Refit one of them, or keep them in separate captures.
     """
-    if evidence.declaration is None:
+    if evidence.declaration is not None:
+        version = evidence.declaration.head_model
+    elif evidence.subject is not None:
+        version = evidence.subject.head.version
+    else:
         return
     others: dict[str, Path] = {}
     for folder in sorted({entry.image.parent.parent for entry in evidence.entries} - {evidence.folder}):
@@ -73,18 +77,15 @@ def _sequence_versions(evidence: Evidence) -> Iterator[Hit]:
             other = layout.Declaration.read(folder) if folder.is_dir() else None
         except InputError:
             continue  # the union's declaration is used; only the version of a sequence's declaration is read
-        if other is not None and other.head_model != evidence.declaration.head_model:
+        if other is not None and other.head_model != version:
             others[other.head_model] = folder
     if others:
         folder = next(iter(others.values()))
-        text = (
-            f"sequence {folder.name} was tracked with {some(others)}, the union says "
-            f"{evidence.declaration.head_model}"
-        )
+        text = f"sequence {folder.name} was tracked with {some(others)}, the union with {version}"
         yield Hit(text, folder / layout.DECLARATION_FILE, "head_model")
 
 
-@rule("HB602", "error", of_layout=True)
+@rule("HB602", "error", of_layout=True, refused=True)
 def _no_head(evidence: Evidence) -> Iterator[Hit]:
     """The head model is missing or broken.
 
@@ -95,7 +96,7 @@ def _no_head(evidence: Evidence) -> Iterator[Hit]:
             yield Hit(f"expected {error.expected}, found {error.found}", error.file, error.key)
 
 
-@rule("HB603", "error", of_layout=True)
+@rule("HB603", "error", of_layout=True, refused=True)
 def _unfit(evidence: Evidence) -> Iterator[Hit]:
     """Parameters do not fit the head model.
 

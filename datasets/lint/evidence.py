@@ -17,15 +17,15 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, FrameKey, Progress, no_progress
+from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import digest
 from ...bench.io.images import ImageInfo, probe_image
 from ...bench.protocol import evenly_with_ends
-from ..clip import CaptureClip
+from ..clip import CaptureClip, FrameFiles
 from ..ga import layout
-from ..ga.content_digests import content_digests
+from ..ga.content_digests import content_digests, digests_of_same_size
 from ..ga.layout import CyConvention
 from ..ga.tracking import Tracking, find_head
 from ..ga.transforms import FrameEntry, parse_frame
@@ -188,6 +188,12 @@ THOROUGH_TIMESTEPS = 32
 """Timesteps on which cameras are measured with ``--thorough``."""
 
 
+FEW_PIXELS, FEWEST_VIEWS = 5_000_000, 12
+FEW_SHOTS, FEWEST_TIMESTEPS = 48, 2
+"""Before a run, most pixels of the views and most images to measure cameras on, which take a few seconds; and numbers of views
+and timesteps that are taken in any case."""
+
+
 class Slot(NamedTuple):
     """Position of a frame in the grid of a capture."""
 
@@ -214,10 +220,10 @@ class Evidence:
         Slots of frames listed in a JSON that could not be read.
     declaration_faults, json_faults, frame_faults, file_faults, head_faults : Sequence[InputError]
         Reasons why content could not be read.
-    headers : Mapping[Path, ImageInfo]
-        Headers of the existing images and masks, by path.
+    pixels : Pixels
+        Headers and pixels of the existing images and masks.
     digests : Mapping[Path, str]
-        Content digest of every existing image.
+        Content digest of every existing image; before a run, see `gather_clip`.
     subject : TrackedSubject | None
         Head and identity that fit the parameters; None if no file fits.
     thumbnails : Sequence[Thumbnail]
@@ -233,7 +239,7 @@ class Evidence:
     of_layout: bool
     background: tuple[float, ...]
     splits: Mapping[str, tuple[FrameEntry, ...]]
-    headers: Mapping[Path, ImageInfo]
+    pixels: Pixels
     digests: Mapping[Path, str]
     parameters: Mapping[int, Parameters]
     subject: TrackedSubject | None
@@ -249,6 +255,11 @@ class Evidence:
     file_faults: Sequence[InputError] = ()
     head_faults: Sequence[InputError] = ()
     refusal: InputError | None = None
+
+    @property
+    def headers(self) -> Mapping[Path, ImageInfo]:
+        """Headers of the existing images and masks, by path."""
+        return self.pixels.headers
 
     @cached_property
     def entries(self) -> tuple[FrameEntry, ...]:
@@ -315,7 +326,7 @@ def gather(folder: Path, settings: LintSettings, progress: Progress) -> Evidence
         frame_faults=frame_faults,
         file_faults=file_faults,
         head_faults=head_faults,
-        headers=headers,
+        pixels=pixels,
         digests=digests,
         parameters=parameters,
         subject=subject,
@@ -324,42 +335,84 @@ def gather(folder: Path, settings: LintSettings, progress: Progress) -> Evidence
     )
 
 
-def gather_clip(folder: Path, clip: CaptureClip, settings: LintSettings, progress: Progress) -> Evidence:
-    """Evidence from a clip of any reader, without the layout's files."""
-    entries = {key: _entry_of(folder, clip, key) for part in clip.splits.values() for key in part}
-    headers = {
-        path: ImageInfo(clip.cameras[key.camera].width, clip.cameras[key.camera].height, 3)
-        for key, entry in entries.items()
-        for path in (entry.image, entry.mask)
-        if path is not None
+def gather_clip(
+    folder: Path, clip: CaptureClip, settings: LintSettings, progress: Progress, *, before_run: bool = False
+) -> Evidence:
+    """Evidence from a clip of any reader, without the layout's files.
+
+    ``before_run`` takes only what the errors need that are searched for before a run: digests of image files that have
+    the same size as one of another split, fewer views and measurements of cameras; no search for near-duplicates and no
+    fit of expressions. Of the layout, what its reader recorded is then used as well.
+    """
+    record = next((step.parameters for step in clip.steps if step.name == "read_capture"), None)
+    record = record if before_run else None
+    cy: CyConvention = "top" if record is None else record["cy"]
+    settings = replace(settings, cy=cy) if record is not None else settings
+    rig: dict[str, dict[str, Any]] = {
+        name: {
+            "camera_index": index,
+            "camera_id": name,
+            "width": camera.width,
+            "height": camera.height,
+            "intrinsics": layout.intrinsics_to_json(camera, cy),
+            "camera_to_world": np.array(layout.extrinsics_to_json(camera.world_to_camera)),
+        }
+        for index, (name, camera) in enumerate(clip.cameras.items())
     }
-    key_of = {entry.image: key for key, entry in entries.items()}
-    files = {files.image for files in clip.files.values() if files.image is not None and not clip.pixel_steps}
-    digests = content_digests(files & key_of.keys(), progress=progress)
-    for done, (path, key) in enumerate(key_of.items(), start=1):
-        if path not in digests:
-            digests[path] = digest(clip.image(key))
-        progress(done, len(key_of), "reading images")
+    entries, headers, key_of = {}, {}, {}
+    for key in [key for part in clip.splits.values() for key in part]:
+        # The key stands in for a file whose pixels are not those of the frame.
+        files = clip.files[key] if before_run or not clip.pixel_steps else FrameFiles(None, None)
+        info = ImageInfo(clip.cameras[key.camera].width, clip.cameras[key.camera].height, 3)
+        image, mask = files.image or Path(str(key)), None
+        headers[image], key_of[image] = info, key
+        if clip.has_mask(key):
+            mask = files.mask or Path(f"{key} mask")
+            headers[mask] = info
+        entries[key] = FrameEntry(
+            file=folder,
+            where=f"frame {key}",
+            timestep=key.timestep,
+            sequence_folder=key.sequence,
+            image=image,
+            mask=mask,
+            parameters=folder,
+            **rig[key.camera],
+        )
     pixels = Pixels(headers, lambda e: clip.image(key_of[e.image]), lambda e: clip.mask(key_of[e.image]))
+    splits = {name: tuple(entries[key] for key in part) for name, part in clip.splits.items()}
     subject = TrackedSubject(Tracking(clip.head, clip.poses, clip.shape, clip.static_offset))
     parameters = {}
     for timestep, pose in clip.poses.items():
         arrays = pose_to_parameters(pose)
         parameters[timestep] = Parameters(timestep, folder, arrays, not_finite(arrays), pose=pose)
-    splits = {name: tuple(entries[key] for key in part) for name, part in clip.splits.items()}
     background = tuple(clip.background.tolist())
     return Evidence(
         folder=folder,
         settings=settings,
-        of_layout=False,
+        of_layout=record is not None,
         background=background,
         splits=splits,
-        headers=headers,
-        digests=digests,
+        pixels=pixels,
+        digests=digests_of_same_size({name: [e.image for e in part] for name, part in splits.items()})
+        if before_run
+        else _every_digest(clip, key_of, progress),
         parameters=parameters,
         subject=subject,
-        **_looked_at(splits, pixels, background, "top", subject, parameters, settings, progress),
+        **_looked_at(
+            splits, pixels, background, cy, subject, parameters, settings, progress, before_run=before_run
+        ),
     )
+
+
+def _every_digest(clip: CaptureClip, key_of: Mapping[Path, FrameKey], progress: Progress) -> dict[Path, str]:
+    """Digest of every image: of its file if its pixels are those of the file."""
+    digests = content_digests((path for path in key_of if path.is_file()), progress=progress)
+    for done, (path, key) in enumerate(key_of.items(), start=1):
+        if path not in digests:
+            digests[path] = digest(clip.image(key))
+        progress(done, len(key_of), "reading images")
+    return digests
 
 
 def _looked_at(
@@ -371,52 +424,33 @@ def _looked_at(
     parameters: Mapping[int, Parameters],
     settings: LintSettings,
     progress: Progress,
+    *,
+    before_run: bool = False,
 ) -> dict[str, Any]:
     """Evidence from decoded frames: fields of `Evidence`."""
     there = {name: [e for e in part if e.image in pixels.headers] for name, part in splits.items()}
     whole = [entry for part in there.values() for entry in part]
-    chosen = whole if settings.thorough else pick_views(whole, settings.views)
+    count, timesteps = settings.views, settings.camera_timesteps
+    if before_run:
+        sizes = {entry.camera_id: (entry.width or 0) * (entry.height or 0) for entry in whole}
+        count = min(count, max(FEWEST_VIEWS, FEW_PIXELS // max(1, *sizes.values())))
+        timesteps = min(timesteps, max(FEWEST_TIMESTEPS, FEW_SHOTS // max(1, len(sizes))))
+    chosen = whole if settings.thorough else pick_views(whole, count)
     views = inspect_views(chosen, pixels, subject, parameters, background, cy, progress=progress)
     limit = len(whole) if settings.thorough else settings.duplicates
-    timesteps = THOROUGH_TIMESTEPS if settings.thorough else settings.camera_timesteps
+    timesteps = THOROUGH_TIMESTEPS if settings.thorough else timesteps
     return {
         "views": views,
-        "thumbnails": make_thumbnails(there, pixels.image, limit, progress=progress),
-        "expression_fit": weigh_expression(whole, views, pixels, subject, parameters, cy),
+        "thumbnails": () if before_run else make_thumbnails(there, pixels.image, limit, progress=progress),
+        "expression_fit": None
+        if before_run
+        else weigh_expression(whole, views, pixels, subject, parameters, cy),
         "cameras": measure_cameras(
             whole, pixels, subject, parameters, cy, timesteps=timesteps, progress=progress
         )
         if timesteps
         else {},
     }
-
-
-def _entry_of(folder: Path, clip: CaptureClip, key: FrameKey) -> FrameEntry:
-    files = clip.files[key]
-    mask = Path(f"{key} mask") if clip.has_mask(key) else None
-    return clip_entry(folder, clip, key, None if clip.pixel_steps else files.image, mask)
-
-
-def clip_entry(
-    folder: Path, clip: Clip, key: FrameKey, image: Path | None = None, mask: Path | None = None
-) -> FrameEntry:
-    """A clip's frame as an entry of the layout, with the key in place of a path that is not given."""
-    camera = clip.cameras[key.camera]
-    return FrameEntry(
-        file=folder,
-        where=f"frame {key}",
-        timestep=key.timestep,
-        camera_index=list(clip.cameras).index(key.camera),
-        camera_id=key.camera,
-        sequence_folder=key.sequence,
-        image=image or Path(str(key)),
-        mask=mask,
-        parameters=folder,
-        width=camera.width,
-        height=camera.height,
-        intrinsics=layout.intrinsics_to_json(camera, "top"),
-        camera_to_world=np.array(layout.extrinsics_to_json(camera.world_to_camera)),
-    )
 
 
 def _read_declaration(folder: Path) -> tuple[layout.Declaration | None, list[InputError]]:

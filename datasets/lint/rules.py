@@ -49,6 +49,9 @@ class Rule:
     of_layout : bool
         Whether it checks files of the GaussianAvatars/VHAP layout; skipped for captures of other
         readers.
+    refused : bool
+        Whether the layout's reader refuses a capture with this error. All other errors are searched for
+        before a run, see `before_run`.
     """
 
     code: str
@@ -57,6 +60,7 @@ class Rule:
     remedy: str
     check: Callable[[Evidence], Iterable[Hit]]
     of_layout: bool = False
+    refused: bool = False
 
 
 @dataclass(frozen=True)
@@ -72,14 +76,14 @@ class Finding:
 
 
 def rule(
-    code: str, severity: Severity, *, of_layout: bool = False
+    code: str, severity: Severity, *, of_layout: bool = False, refused: bool = False
 ) -> Callable[[Callable[[Evidence], Iterable[Hit]]], Rule]:
     """Make a rule of a check. The check's docstring gives the title in its first line, and the remedy below."""
 
     def make(check: Callable[[Evidence], Iterable[Hit]]) -> Rule:
         title, _, remedy = inspect.cleandoc(check.__doc__ or "").partition("\n\n")
         title = title[:1].lower() + title[1:].removesuffix(".")
-        return Rule(code, severity, title, " ".join(remedy.split()), check, of_layout)
+        return Rule(code, severity, title, " ".join(remedy.split()), check, of_layout, refused)
 
     return make
 

@@ -26,6 +26,9 @@ from .mesh import MeshFacts, Parameters, TrackedSubject, lay_mesh
 BACKGROUND_LEVELS = 12
 """Maximum difference of any channel of background pixels; JPEG changes flat areas by less."""
 
+FLAT_LEVELS, ROOM = 3, 0.02
+"""Maximum difference from the median in corners of one colour, and maximum fraction of other pixels in them."""
+
 BLANK_LEVELS = 2.0
 """Images with less `structure` have a single colour."""
 
@@ -83,6 +86,8 @@ class ViewFacts:
         Median colour (3,) of the upper corners.
     corners_off : float
         Fraction of their pixels that differ from the declared background.
+    room : bool
+        Whether these pixels have several colours, as if a room is shown and no background was set.
     blank : bool
         Whether its pixels (the subject's if there is a mask) have no more contrast than noise.
     has_alpha : bool
@@ -103,6 +108,7 @@ class ViewFacts:
     grey: bool = False
     corners: FloatArray | None = None
     corners_off: float = 0.0
+    room: bool = False
     blank: bool = False
     has_alpha: bool = False
     mask: MaskFacts | None = None
@@ -201,21 +207,23 @@ def _facts(
     mesh: MeshFacts | None,
     background: Sequence[float],
 ) -> ViewFacts:
-    ground = np.round(np.asarray(background) * 255)
+    ground = np.round(np.asarray(background) * 255).astype(np.int16)
     off = np.abs(image.astype(np.int16) - ground).max(axis=2) > BACKGROUND_LEVELS
     shown = mask > 250 if mask is not None else off  # no mixture with the background
     pixels = image[shown] if shown.any() else image.reshape(-1, 3)
     width = max(1, info.width // 10)
     corners = np.zeros(off.shape, dtype=bool)
     corners[:width, :width] = corners[:width, -width:] = True
+    colour = np.median(image[corners], axis=0)
     return ViewFacts(
         entry=entry,
         low=int(image.min()),
         high=int(image.max()),
         subject_low=int(pixels.min()),
         subject_high=int(pixels.max()),
-        grey=bool((np.ptp(image, axis=2) == 0).all()),
-        corners=np.median(image[corners], axis=0),
+        grey=bool((image == image[..., :1]).all()),
+        corners=colour,
+        room=float((np.abs(image[corners] - colour).max(axis=1) > FLAT_LEVELS).mean()) > ROOM,
         corners_off=float(off[corners].mean()),
         blank=_blank(image, shown, off),
         has_alpha=info.has_alpha,
@@ -232,7 +240,7 @@ def _blank(image: ByteArray, shown: np.ndarray, off: np.ndarray) -> bool:
     return bool(shown.any() and off[shown].mean() > 0.5 and structure(grey, shown) < BLANK_LEVELS)
 
 
-def _mask_facts(image: ByteArray, mask: ByteArray, off: np.ndarray, ground: FloatArray) -> MaskFacts:
+def _mask_facts(image: ByteArray, mask: ByteArray, off: np.ndarray, ground: np.ndarray) -> MaskFacts:
     covered = mask > 127
     distance = cv2.distanceTransform((mask == 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     far = (mask == 0) & (distance > FAR * len(mask)) if (mask > 0).any() else mask == 0
@@ -247,7 +255,7 @@ def _mask_facts(image: ByteArray, mask: ByteArray, off: np.ndarray, ground: Floa
     )
 
 
-def _fringe(image: ByteArray, mask: ByteArray, ground: FloatArray) -> float | None:
+def _fringe(image: ByteArray, mask: ByteArray, ground: np.ndarray) -> float | None:
     """See `MaskFacts.fringe`."""
     alpha = mask.astype(np.float32) / 255
     inner = (alpha > 0.98).astype(np.float32)

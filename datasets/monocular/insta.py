@@ -12,6 +12,10 @@
 no axis is flipped. The world is that of FLAME with root and neck at rest. Identity is not in a parameter file: it is
 fitted to ``canonical.obj``, and other missing parameters to the meshes (see `mesh_fit`). The tracker's eyelids are
 only in the meshes and fitted if the head model has a basis for them.
+
+Formats read:
+
+- INSTA's training folders. Written by Zielon/INSTA@9c17968e (`scripts/transforms.py`). Not checked on a file of the program.
 """
 
 from __future__ import annotations

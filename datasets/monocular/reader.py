@@ -2,6 +2,10 @@
 
 The layouts are those of `insta` and `imavatar`. VHAP's monocular export has GaussianAvatars' layout and is
 read by the reader ``ga``.
+
+Formats read:
+
+- IMavatar's `flame_params.json`. Written by zhengyuf/IMavatar@923b60aa (`preprocess/DECA/optimize.py`). Not checked on a file of the program.
 """
 
 from __future__ import annotations
@@ -213,7 +217,7 @@ def read_video(
     exclude, cache_mb, use_cache : Mapping[int, str] | str | Path | None, float, bool
         As for the reader ``ga``.
     """
-    root = Path(os.path.abspath(path))
+    root = Path(os.path.realpath(path))
     declaration = Declaration.read(root)
     asset = _find_head(root, declaration, head, masks=masks, regions=regions, eyelids=eyelids)
     track = _read_track(root, asset, progress)

@@ -3,6 +3,11 @@
 Two forms of colour calibration exist. Version 1 is an affine map on the stored values, ``SER.npy``. Version 2 is a
 polynomial on linear values, ``color_calibration.json``. Images are 8-bit sRGB before and after. VHAP's reader
 computes the version 2 correction and then returns the uncorrected image, so exports made with it carry raw colours.
+
+Formats read:
+
+- NeRSemble's colour calibration, version 1 and 2. Written by the authors of tobias-kirschstein/nersemble-data@14e967e3,
+  whose `src/nersemble_data/util/color_correction.py` it follows. Not checked on a file of the program.
 """
 
 from __future__ import annotations

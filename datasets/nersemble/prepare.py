@@ -388,7 +388,7 @@ def _moved(camera: Camera, shift: FloatArray) -> Camera:
 def _write_tracked(job: SequenceJob, tracked: TrackedSequence, declaration: layout.Declaration) -> None:
     """Write parameters and JSONs in the world whose mean translation is zero."""
     for timestep in range(tracked.count):
-        path = job.folder / "flame_param" / layout.parameter_name(timestep)
+        path = job.folder / layout.TRACKING_FOLDER / layout.parameter_name(timestep)
         save_npz(path, tracked.parameters(timestep))
     save_npz(job.folder / layout.CANONICAL_FILE, tracked.canonical())
     frames = _frames(job, tracked.shift)

@@ -13,6 +13,12 @@ The benchmark toolkit's folders read as the second release. Parts of the first r
 
 ``camera_params.json`` holds world-to-camera matrices with OpenCV axes in metres, and one intrinsic matrix for all
 cameras (raw recordings) or one per camera (the benchmark's cropped videos); no lens distortion.
+
+Formats read:
+
+- NeRSemble's `camera_params.json`. Written by the authors of tobias-kirschstein/nersemble-data@14e967e3 and
+  tobias-kirschstein/nersemble-benchmark@e15f204d, whose readers it follows. Not checked on a file of the program.
+- NeRSemble's `metadata_sequences.csv`. Written by the authors of tobias-kirschstein/nersemble-data@14e967e3. Not checked on a file of the program.
 """
 
 from __future__ import annotations
@@ -30,7 +36,7 @@ from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json, read_text
 from ...bench.io.files import check_name, entries, reading
-from ..ga.transforms import found_entry, read_matrix, read_rigid
+from ..ga.transforms import MAX_INTEGER, found_entry, read_matrix, read_rigid
 from .names import BACKGROUND, FULL_SIZE, is_subject, match_sequence, serial_of
 from .pixels import Correction, affine_correction, polynomial_correction
 
@@ -268,9 +274,10 @@ def _size(path: Path, value: Mapping[str, Any], per_camera: bool) -> tuple[int, 
     sizes = []
     for key in ("width", "height"):
         number = value.get(key)
-        if not isinstance(number, int) or isinstance(number, bool) or number < 1:
+        plain = isinstance(number, (int, float)) and not isinstance(number, bool)
+        if number is None or not plain or not 1 <= number < MAX_INTEGER or number % 1:
             raise InputError(path, key, "a number of pixels from 1", found_entry(number))
-        sizes.append(number)
+        sizes.append(int(number))
     return sizes[0], sizes[1]
 
 

@@ -1,4 +1,9 @@
-"""Tracked FLAME parameters of VHAP, found by subject and sequence, and validated."""
+"""Tracked FLAME parameters of VHAP, found by subject and sequence, and validated.
+
+Formats read:
+
+- VHAP's `tracked_flame_params_*.npz`. Written by ShenhanQian/VHAP@4b64ab7d (`vhap/model/tracker.py`). Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def check_unions(
 
 def _report(root: Path, subject: str, rejoin: bool) -> UnionReport:
     try:
-        folder = _find(root, subject)
+        folder = _find(root.resolve(), subject)
         entries = {name: read_transforms(folder / file) for name, file in layout.SPLIT_FILES.items()}
         everything = [entry for part in entries.values() for entry in part]
         check_timesteps(folder, everything)

@@ -14,8 +14,9 @@ from matplotlib.colors import ListedColormap
 from scipy.spatial.transform import Rotation
 
 from ...bench.contracts import ByteArray, Clip, FloatArray, FrameKey, HeadPose, Progress, no_progress
+from ...bench.io.figures import pixels
 from ..clip import CaptureClip
-from ..figures import HELD_OUT, LEAK, MUTED, TRAIN, bands, new_figure, pixels, shortened, show
+from ..figures import HELD_OUT, LEAK, MUTED, TRAIN, bands, new_figure, shortened, show
 from ..head.rotations import rotation_of
 from ..head.subject import PosedSubject, pose_in_head_frame
 from ..mesh_pictures import draw_mesh, portrait_camera

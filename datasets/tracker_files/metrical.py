@@ -4,6 +4,10 @@ Root and neck rest; the head's motion is in the camera. ``opencv`` has world-to-
 of the tracked image, both made by PyTorch3D, whose image starts at the corner of the first pixel. Rotations are the
 first two rows of matrices. The order of ``img_size`` is height, width. ``camera`` (the same in PyTorch3D's form),
 texture ``tex`` and light ``sh`` are not read.
+
+Formats read:
+
+- Metrical Tracker's `checkpoint/*.frame`. Written by Zielon/metrical-tracker@c2a51724 (`tracker.py`). Not checked on a file of the program.
 """
 
 from __future__ import annotations

@@ -6,6 +6,13 @@ image, and the principal point is (1 + pp) (size / 2 + 1/2). This is how the pro
 projected with an offset of one pixel of the tracked image (256 pixels by default) in x, so a residual of that size is its
 own. Rotations are the first two rows of matrices. In its masks, labels of parts are 1 to 18, background is 0, and what lies
 outside the parsed box is 20. ``joint_transforms`` follow from the other parameters and are not read.
+
+Formats read:
+
+- Pixel3DMM's `checkpoint/*.frame`. Written by SimonGiebenhain/pixel3dmm@98b5d79f (`src/pixel3dmm/tracking/tracker.py`).
+  Checked on tobias-kirschstein/flexavatar@c1a31a74
+  `data/pixel3dmm_processing/tracking/itw/einstein/tracking_nV1_noPho_uv2000.0_n1000.0/checkpoint/00000.frame` (rotations
+  equal its matrices `R_rotation_matrix` and `joint_transforms`).
 """
 
 from __future__ import annotations

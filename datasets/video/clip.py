@@ -1,4 +1,12 @@
-"""A video file as a clip that is not tracked yet: frames with a face, cropped and masked, and one camera."""
+"""A video file as a clip that is not tracked yet: frames with a face, cropped and masked, and one camera.
+
+Formats read:
+
+- Masks of the frames of a video. Written by PeterL1n/RobustVideoMatting (`inference_utils.py`). Not checked on a file of
+  the program.
+- Network of a person's mask. Written by google-ai-edge/mediapipe 0.10.21. Checked on
+  `mediapipe/modules/selfie_segmentation/selfie_segmentation.tflite` of its wheel.
+"""
 
 from __future__ import annotations
 
@@ -161,7 +169,9 @@ class MaskSource:
         return view.image(read_mask(self._file(frame.number), (frame.image.shape[1], frame.image.shape[0])))
 
     def _file(self, number: int) -> Path:
-        return Path(self.options.masks) / f"{number:05d}.png"
+        names = [f"{number:0{digits}d}{suffix}" for digits in (5, 4) for suffix in (".png", ".jpg")]
+        paths = [Path(self.options.masks, name) for name in names]
+        return next((path for path in paths if path.exists()), paths[0])
 
 
 FACES, IMAGES, MASKS = "faces.npz", "images", "masks"

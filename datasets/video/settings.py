@@ -16,8 +16,8 @@ class VideoOptions:
     """Video: MediaPipe's selfie_segmentation.tflite, which finds the person in each frame; needs ai-edge-litert."""
 
     masks: str = ""
-    """Video: folder of masks instead, of the video's size, named by the number of the frame in the file (00000.png is the first
-    frame, also where --rate takes fewer); "background" for the difference from the empty room, which a static camera must show
+    """Video: folder of masks instead, of the video's size, named by the number of the frame in the file (00000.png or 0000.jpg is
+    the first frame, also where --rate takes fewer); "background" for the difference from the empty room, which a static camera must show
     for some seconds without a person; or "none" to keep the room behind the person, which then counts in every metric."""
 
     focal: float | None = None

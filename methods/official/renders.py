@@ -1,5 +1,13 @@
-"""Numbering of renders in the official repositories (`MethodSpec.renders`, ``headbench evaluate
---names``)."""
+"""Numbering of renders in the official repositories (`MethodSpec.renders`, ``headbench evaluate --names``).
+
+Formats read:
+
+- Renders of GaussianAvatars. Written by ShenhanQian/GaussianAvatars 30cc4bde (`render.py`). Not checked on a file of the
+  program.
+- Renders of GaussianBlendshapes. Written by zjumsj/GaussianBlendshapes a0ab7c01 (`test.py`). Not checked on a file of the
+  program.
+- Renders of INSTA. Written by Zielon/INSTA 0c06b701 (`src/rta/recorder.cu`). Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 

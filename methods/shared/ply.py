@@ -1,4 +1,9 @@
-"""PLY files of one float32 vertex table, as read by splat viewers."""
+"""PLY files of one float32 vertex table, as read by splat viewers.
+
+Formats read:
+
+- PLY of splats. Written by ShenhanQian/GaussianAvatars 30cc4bde (`scene/gaussian_model.py`). Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
+import psutil
 import pytest
 import torch
 
@@ -56,7 +57,7 @@ def test_the_load_is_what_cores_worked_less_the_own_time(monkeypatch, busy, own,
     waited = []
     monkeypatch.setattr(machine.time, "perf_counter", lambda: next(now))
     monkeypatch.setattr(machine.time, "sleep", waited.append)
-    monkeypatch.setattr(machine, "processor_count", lambda: 2)
+    monkeypatch.setattr(machine, "processor_capacity", lambda: 2)
     for name, values in (("_busy_seconds", iter(busy)), ("_own_processor_seconds", iter(own))):
         monkeypatch.setattr(machine, name, lambda values=values: next(values))
     with ProcessorLoad(wait=wait) as load:
@@ -65,6 +66,54 @@ def test_the_load_is_what_cores_worked_less_the_own_time(monkeypatch, busy, own,
     assert ("other_cores" in load.details) == (expected is not None)
     assert waited == ([pytest.approx(0.4)] if wait else [])
     assert (load.threads, load.cores) == (torch.get_num_threads(), 2)
+
+
+QUOTA, PERIOD = "cpu.cfs_quota_us", "cpu.cfs_period_us"
+
+
+@pytest.mark.parametrize(
+    ("own", "files", "capacity", "threads", "memory"),
+    [
+        ("0::/", {}, 8, 8, None),
+        ("0::/", {"cpu.max": "100000 100000", "memory.max": "max"}, 1, 1, None),  # in a container, version 2
+        ("0::/", {"cpu.max": "max 100000", "memory.max": "4096"}, 8, 8, 4096),
+        ("0::/", {"cpu.max": "150000 100000"}, 1.5, 1, None),
+        ("0::/", {"cpu.max": "25000 50000"}, 0.5, 1, None),
+        ("0::/", {"cpu.max": "1600000 100000"}, 8, 8, None),  # more than the affinity
+        # The least of the own group and those above it.
+        (
+            "0::/a.slice/b",
+            {"a.slice/cpu.max": "200000 100000", "a.slice/b/cpu.max": "300000 100000"},
+            2,
+            2,
+            None,
+        ),
+        ("3:cpuset:/\n2:cpu,cpuacct:/", {f"cpu/{QUOTA}": "-1", f"cpu/{PERIOD}": "100000"}, 8, 8, None),
+        # Version 1, with the path on the host, which the container does not have.
+        (
+            "2:cpu,cpuacct:/docker/1\n1:memory:/docker/1\n0::/",
+            {f"cpu/{QUOTA}": "50000", f"cpu/{PERIOD}": "25000", "memory/memory.limit_in_bytes": "8192"},
+            *(2, 2, 8192),
+        ),
+    ],
+)
+def test_quotas_of_cgroups_limit_cores_and_memory(
+    monkeypatch, tmp_path, own, files, capacity, threads, memory
+):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)), raising=False)
+    monkeypatch.setattr(machine, "CGROUPS", tmp_path)
+    monkeypatch.setattr(machine, "OWN_CGROUPS", tmp_path / "own")
+    monkeypatch.setenv("OMP_NUM_THREADS", "")  # so that it is as before at the end
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    for name, text in {"own": own, **files}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(f"{text}\n")
+    record = machine_record()
+    assert (record["cores"], machine.processor_count()) == (capacity, threads)
+    assert record["memory_bytes"] == (memory or psutil.virtual_memory().total)
+    assert machine.machine_name().endswith(f"({capacity} core{'s' * (capacity != 1)})")
+    machine.limit_threads()
+    assert os.environ.get("OMP_NUM_THREADS") == (None if threads == 8 else str(threads))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")

@@ -95,6 +95,14 @@ def test_rows_are_the_same_when_read_back(rows, tmp_path):
     assert again.select(**NAMED).equals(rows.select(**NAMED))
 
 
+def test_the_file_has_encodings_of_parquet_1_alone(rows, tmp_path):
+    rows.write(tmp_path / "rows.parquet")
+    group = pq.ParquetFile(tmp_path / "rows.parquet").metadata.row_group(0)
+    columns = [group.column(index) for index in range(group.num_columns)]
+    assert {name for column in columns for name in column.encodings} <= {"PLAIN", "RLE", "RLE_DICTIONARY"}
+    assert {column.compression for column in columns} <= {"GZIP", "SNAPPY", "UNCOMPRESSED"}
+
+
 def test_single_precision_keeps_seven_digits(rows, tmp_path):
     table = pd.concat([rows.select(**NAMED)] * 100, ignore_index=True)
     table["value"] = np.random.default_rng(0).uniform(20, 40, len(table))

@@ -144,6 +144,26 @@ def test_every_public_name_has_an_entry(reference):
     assert set(headbench.__all__) <= documented
 
 
+def test_formats_state_writer_and_check(reference):
+    rows = re.findall(r"^\| (.+) \| (.+) \| (.+) \| `(.+)` \|$", reference["formats"], re.MULTILINE)
+    checked = [row for row in rows if row[2] != "**not checked**"]
+    assert f"{len(checked)} of {len(rows)} formats were checked" in reference["formats"]
+    for name in ("loaders", "drive/formats", "drive/blendshapes", "import_ga", *READ_PACKAGES):
+        assert any(name in row[3] for row in rows), name
+    for _, _, check, _ in checked:
+        assert re.search(r"\w+/[\w.-]+@[0-9a-f]{8}\b|package|wheel", check), check
+
+
+READ_PACKAGES = (
+    "datasets/ga",
+    "datasets/colmap",
+    "datasets/monocular",
+    "datasets/nersemble",
+    "datasets/tracker_files",
+)
+"""Packages of readers of other programs' captures."""
+
+
 def test_every_environment_variable_is_listed():
     page = (ROOT / "docs" / "reference" / "environment.md").read_text(encoding="utf-8")
     listed = set(re.findall(r"^\| `(\w+)`", page, re.MULTILINE))

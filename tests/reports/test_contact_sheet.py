@@ -5,9 +5,9 @@ from matplotlib import rc_context
 from matplotlib.colors import to_rgb
 
 from headbench.bench.errors import InputError
+from headbench.bench.io import figures
 from headbench.bench.io.images import read_png
 from headbench.bench.protocol import evenly
-from headbench.reports import drawing
 from headbench.reports.contact_sheet import ComparedFrame, contact_sheet
 from headbench.reports.drawing import BOX, SheetSection, Tile, TileRow, colour_map, write_sheet
 
@@ -138,7 +138,7 @@ def test_marked_images_have_a_frame_outside_their_pixels(tmp_path):
 
 def test_a_sheet_longer_than_matplotlib_draws_becomes_smaller(tmp_path, monkeypatch):
     whole = draw(tmp_path, picture(0), {"a": "failed"}, 60)
-    monkeypatch.setattr(drawing, "LONGEST", 400)
+    monkeypatch.setattr(figures, "LONGEST", 400)
     small = draw(tmp_path, picture(0), {"a": "failed"}, 60)
     assert max(small.shape) in (399, 400)
     assert small.shape[0] == pytest.approx(whole.shape[0] * 400 / max(whole.shape), abs=1)

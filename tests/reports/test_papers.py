@@ -1,9 +1,13 @@
 """Printed tables as data, and runs in their form."""
 
+from dataclasses import replace
+
 import pytest
 import yaml
 
+from headbench.bench.condition import PLAIN, Condition, Named
 from headbench.bench.configuration import build_file
+from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.registry import discover
 from headbench.reports import papers as module
@@ -63,6 +67,25 @@ def test_settings_decide_the_printed_row_of_a_method(write_run):
     ]
     other = write_run("b", {"ours": 33.0}, {"ours": {"lines": {"dynamic": ["color"]}}})
     assert shown([other], "4").groups[0][1][0].method == "ours"
+
+
+def test_a_condition_is_a_printed_row_by_its_settings_alone(write_run):
+    tracked = Named("tracked")
+    conditions = {
+        "moved": (GEOMETRY, Condition("moved", ("ours",), GEOMETRY)),
+        "moved-tracked": (GEOMETRY, Condition("moved-tracked", settings=GEOMETRY, clip=tracked)),
+        "tracked": (OPACITY, Condition("tracked", clip=tracked)),
+        "off": ({"lines": {"dynamic": []}}, Condition("off", settings={"lines": {"dynamic": []}})),
+    }
+    settings = {"ours": OPACITY} | {f"ours+{name}": config for name, (config, _) in conditions.items()}
+    folder = RunFolder(write_run("a", {name: 30.0 + i for i, name in enumerate(settings)}, settings))
+    manifest = folder.read_manifest()
+    known = (PLAIN, *(condition for _, condition in conditions.values()))
+    replace(manifest, configuration=replace(manifest.configuration, conditions=known)).write(folder.manifest)
+    measured = {number: shown([folder.root], number).groups[0][1] for number in ("3", "4")}
+    assert [row.method for row in measured["3"]] == ["Ours"]
+    names = ["Ours, opacity", "Ours, position rotation scale (moved)"]
+    assert [(row.method, row.cells[0].text) for row in measured["4"]] == list(zip(names, ["30.00", "31.00"]))
 
 
 def test_printed_metrics_that_a_run_lacks_are_missing(write_run, tmp_path, monkeypatch):

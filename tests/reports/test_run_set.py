@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import pytest
 
 from headbench.bench.errors import InputError
 from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from headbench.bench.rows import ALL
-from headbench.reports.runs import FrameSelection, RunSet
+from headbench.reports.runs import FrameSelection, RunData, RunSet, check_same_protocol
 from headbench.reports.table_report import table_of, table_text
 from headbench.reports.writers import to_markdown
 
@@ -244,6 +246,15 @@ def test_runs_of_other_subjects_are_read_as_one_run(make_run):
     assert to_markdown(table_of(joined)) == to_markdown(table_of(one))
     with pytest.raises(InputError, match="Score the same frames"):
         RunSet.read([both, apart[0]])
+
+
+def test_captures_whose_files_differ_are_named_as_the_reason(make_run):
+    run = RunData.read(make_run("both"))
+    task = run.tasks[0]
+    record = replace(run.manifest.protocols[task], hash="0" * 12, clips=(("subject1", "another"),))
+    other = replace(run, manifest=replace(run.manifest, protocols={task: record}))
+    with pytest.raises(InputError, match="files of the captures differ in content"):
+        check_same_protocol(run, other, task)
 
 
 def test_the_shared_subjects_are_those_of_every_method(make_run):

@@ -8,7 +8,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
 from ....bench.contracts import ByteArray
-from ...figures import new_figure, pixels, show
+from ....bench.io.figures import pixels
+from ...figures import new_figure, show
 from ...mesh_pictures import CLAY, draw_mesh, portrait_camera
 from ..subject import PosedSubject
 from .refit import Refitted

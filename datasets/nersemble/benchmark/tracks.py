@@ -1,6 +1,11 @@
 """Videos that the NeRSemble benchmark requests: participants, sequences, size, rate and length.
 
 Source: the documentation and constants of nersemble-benchmark (commit e15f204, 2026-04).
+
+Formats read:
+
+- FLAME tracking of the NeRSemble benchmark. Written by the authors of tobias-kirschstein/nersemble-benchmark@e15f204d,
+  whose `src/nersemble_benchmark/data/benchmark_data.py` it follows. Not checked on a file of the program.
 """
 
 from __future__ import annotations

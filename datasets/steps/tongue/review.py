@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from ....bench.contracts import ByteArray, Camera, Clip, FloatArray
-from ...figures import new_figure, pixels, shortened, show
+from ....bench.io.figures import pixels
+from ...figures import new_figure, shortened, show
 from ...images import write_image
 from ..exclude import Exclusions
 from .evidence import MouthEvidence

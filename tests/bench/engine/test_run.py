@@ -205,10 +205,11 @@ def test_needs_are_checked_before_training(config, toy, monkeypatch, refuses, ne
 def test_a_capture_without_a_head_is_refused(config, refuses):
     """By what its reader names as `errors`; the option of the command goes on."""
     (Path(config.data) / "subject-wall").mkdir()
-    refuses(config, "capture of subject-wall: expected a capture on which .* found HB701: no head is seen.")
+    refuses(config, "capture of subject-wall: expected a capture without .* found HB701: no head is seen.")
     assert "--unchecked" in str(pytest.raises(InputError, runner.run, config).value)
     runner.run(config, unchecked=True)
-    runner.run(config)  # nothing is left to train
+    runner.run(replace(config, seeds=(0, 1)))  # of captures that the run has
+    assert RunFolder(Path(config.out)).read_manifest().unchecked
 
 
 def test_other_settings_in_the_same_folder_are_refused(config, kept, refuses):

@@ -84,6 +84,7 @@ def test_any_name_gives_valid_xml_and_stays_in_its_cell(subject, note):
     verdict = verdict_of(0.0, 1.0, Tolerance(True, 0.1), ResultKey("t", "a", subject, "full", "m"))
     root = ElementTree.fromstring(to_junit([verdict], [note]).split("\n", 1)[1])
     assert root.find("testsuite/testcase/failure") is not None
+    assert all(element.get("time") for element in (*root.iter("testcase"), *root.iter("testsuite")))
     table = [line for line in to_markdown([verdict], 1, []).splitlines() if line.startswith("| regressed")]
     assert len(table) == 1
     assert table[0].replace("\\\\", "").replace("\\|", "").count("|") == 10

@@ -8,14 +8,17 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from headbench.bench.engine.config import build_run_config
 from headbench.bench.errors import InputError, UnavailableError, is_damage
 from headbench.bench.io import files
+from headbench.bench.io.documents import checked, read_json
 from headbench.bench.io.files import (
     KINDS,
     MAX_NAME_BYTES,
     atomic_path,
     check_kind,
     check_name,
+    check_output_folder,
     check_writable,
     digest,
     digest_file,
@@ -23,6 +26,7 @@ from headbench.bench.io.files import (
     output_inside,
     reading,
     refuse_links,
+    write_json,
     write_text,
 )
 
@@ -176,6 +180,28 @@ def test_results_are_not_written_over_by_a_named_file(tmp_path):
         with pytest.raises(InputError, match="--out: expected a file that is new"):
             check_writable(tmp_path / name, "--out")
     check_writable(tmp_path / "target.md", "--out")  # a table of an earlier time
+
+
+LATIN = os.fsdecode("Größe".encode("latin-1"))
+
+
+@pytest.mark.parametrize(
+    ("name", "fits"), [(LATIN, False), ("Größe\n#1 %41 \N{PARROT}", True), ("C:\\udcf6", True)]
+)
+def test_what_is_written_can_be_read_back(tmp_path, name, fits):
+    folder, json = tmp_path / name / "out", tmp_path / "run.json"
+    for write in (
+        lambda: write_json(json, {"data": [name]}),
+        lambda: check_output_folder(folder),
+        lambda: check_writable(tmp_path / name, "--out"),
+        lambda: build_run_config({"data": name, "out": "o"}, "run.yaml"),
+    ):
+        with nullcontext() if fits else pytest.raises(InputError, match="in UTF-8, found .*\\\\udcf6"):
+            write()
+    assert not folder.parent.exists()
+    assert json.exists() == fits
+    if fits:
+        assert checked(read_json(json), dict[str, list[str]], json) == {"data": [name]}
 
 
 def test_a_tilde_is_the_home_folder(monkeypatch):

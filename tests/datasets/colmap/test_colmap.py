@@ -281,6 +281,12 @@ def test_an_exported_dataset_with_tracking_is_read_back(clip, tmp_path, naming):
     assert found.excluded == clip.excluded
     assert check_clip(found) == []
     assert found.head.fingerprint() == clip.head.fingerprint()
+    as_text = dataset.with_name("text")
+    shutil.copytree(dataset, as_text)
+    theirs(dataset).write_text(as_text / "sparse" / "0")
+    for file in ("cameras.bin", "images.bin"):
+        (as_text / "sparse" / "0" / file).unlink()
+    assert open_clip(as_text).fingerprint == open_clip(dataset).fingerprint
     for timestep, pose in clip.poses.items():
         np.testing.assert_allclose(found.poses[timestep].expression, pose.expression, atol=1e-6)
     for key in clip.files:
@@ -348,7 +354,9 @@ def test_sigterm_keeps_its_handler_with_pycolmap():
     assert (ended.returncode, ended.stderr) == (7, "")
 
 
-@pytest.mark.parametrize(("start", "end"), [("", "\n"), ("\ufeff", "\r\n")])
+@pytest.mark.parametrize(
+    ("start", "end"), [("", "\n"), ("\ufeff", "\r\n"), (" # of another program\n\t", "\n")]
+)
 @pytest.mark.parametrize("name", ["a b/00001_x.png", "a\\b\\00001 x.PNG", "a  b.png"])
 def test_names_and_line_ends_of_other_systems_are_read(tmp_path, start, end, name):
     camera = "1 PINHOLE 64 48 50 50 32 24"

@@ -172,6 +172,13 @@ def arrays():
     return "arrays"
 
 
+def tracked():
+    """A folder of Metrical Tracker, which has a file for each frame."""
+    Path("tracked/checkpoint").mkdir(parents=True)
+    Path("tracked/checkpoint/00000.frame").touch()
+    return "tracked"
+
+
 REFUSED = {
     "no file": (lambda: "none.csv", (), "no such file"),
     "empty csv": (lambda: csv(""), (), "empty file"),
@@ -184,7 +191,11 @@ REFUSED = {
     "not finite": (lambda: csv("jawOpen\nnan\n"), (), "finite numbers"),
     "a short line": (lambda: csv("jawOpen,jawLeft\n1\n"), (), "line 2: expected 2 values"),
     "percent": (lambda: csv("jawOpen\n87\n"), (), "from -2 to 2, found 87"),
-    "json lines that differ": (lambda: lines('{"jawOpen": 1}\n{"jawLeft": 1}\n'), (), "line 2, jaw"),
+    "json lines that differ": (
+        lambda: lines('{"jawOpen": 1}\n{"jawLeft": 1}\n'),
+        (),
+        "jawOpen, line 2: expected a",
+    ),
     "damaged json": (lambda: lines('{"jawOpen": 1}\n{"jawO'), (), "line 2: expected valid JSON"),
     "null": (lambda: lines('{"jawOpen": null}\n'), (), "jawOpen, line 1"),
     "unequal lengths": (lambda: npz(expression=ONE, jaw=np.zeros((4, 3))), (), "jaw: expected 9 frames"),
@@ -222,6 +233,8 @@ REFUSED = {
     "a short window": (lambda: "signal.npz", ("--smooth", "0.04"), "--smooth"),
     "a long window": (lambda: "signal.npz", ("--smooth", "5"), "--smooth"),
     "sequence of no capture": (lambda: "signal.npz", ("--sequence", "FREE"), "a signal that is a capture"),
+    "a video": (lambda: (Path("a.mp4").write_text("x"), "a.mp4")[1], (), "found a video"),
+    "frames of Metrical Tracker": (tracked, (), "headbench import tracking"),
     "an empty folder": (lambda: (Path("empty").mkdir(), "empty")[1], (), "files npz, npy or json"),
 }
 

@@ -100,6 +100,73 @@ def test_size_and_intrinsics_may_stand_at_the_top_level(tmp_path):
     assert read_transforms(path)[0].intrinsics["cx"] == 21.0
 
 
+SPELLINGS = {
+    "absolute": lambda folder, path: (folder / path).resolve().as_posix(),
+    "from two folders up": lambda folder, path: f"../../{folder.parent.name}/{path[3:]}",
+    "through the folder itself": lambda folder, path: f"../{folder.name}/.././{path[3:]}",
+    "through a link": lambda folder, path: f"linked/{path[3:]}",
+    "with backslashes": lambda folder, path: path.replace("/", "\\"),
+    "one absolute, one not": lambda folder, path: (
+        (folder / path).resolve().as_posix() if path.endswith("00000.npz") else path
+    ),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_sequences_are_those_of_the_parameters(capture, spelling):
+    """Each frame belongs to the sequence whose parameters it names, however the path is spelled."""
+    expected = read_capture(capture.union)
+    (capture.union / "linked").symlink_to("..")
+
+    def spell(frame):
+        for key in ("file_path", "fg_mask_path", "flame_param_path"):
+            if spelling != "one absolute, one not" or frame["camera_index"]:
+                frame[key] = SPELLINGS[spelling](capture.union, frame[key])
+
+    for file in ("transforms_train.json", "transforms_val.json", "transforms_test.json"):
+        capture.edit(file, lambda document: [*map(spell, document["frames"])])
+    found = read_capture(capture.union)
+    assert found.splits == expected.splits
+    assert len({key.sequence for key in found.files}) == 3
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "attribute", "expected"),
+    [
+        ("camera_id", 222200037, "camera_id", "222200037"),
+        ("camera_id", 7.0, "camera_id", "7"),
+        ("camera_id", None, "camera_id", "02"),
+        ("camera_index", 2.0, "camera_index", 2),
+        ("timestep_index", 3.0, "timestep", 3),
+        ("w", 48.0, "width", 48),
+        ("fl_x", None, "intrinsics", {"camera_angle_x": 0.5}),
+        ("fl_x", 90, "intrinsics", {"camera_angle_x": 0.5, "fl_x": 90.0}),
+        ("fg_mask_path", None, "mask", None),
+        ("flame_param_path", "../SEQ/flame/12.npz", "sequence_folder", "here"),
+        ("flame_param_path", "flame_param/EXP-1/12.npz", "sequence_folder", "here"),
+        ("flame_param_path", "D:\\074_EXP-1\\flame_param\\12.npz", "sequence_folder", "074_EXP-1"),
+        ("flame_param_path", "EXP-1/flame_param/12.npz", "sequence_folder", "EXP-1"),
+    ],
+)
+def test_entries_as_other_programs_write_them(tmp_path, key, value, attribute, expected):
+    (tmp_path / "here").mkdir()
+    assert getattr(only_entry(tmp_path / "here", **{key: value}), attribute) == expected
+
+
+@pytest.mark.parametrize("image", ["../SEQ/images/0.png", "images/SEQ/0.png"])
+def test_the_sequence_folder_holds_images_and_parameters(tmp_path, image):
+    entry = only_entry(tmp_path, file_path=image, flame_param_path=image.replace("images", "tracked"))
+    assert entry.sequence_folder == ("SEQ" if image.startswith("..") else tmp_path.name)
+
+
+def only_entry(folder, **values):
+    """The entry of a JSON with one frame, which has these values."""
+    frame = {"timestep_index": 1, "camera_index": 2, "camera_angle_x": 0.5, "file_path": "images/0.png"}
+    frame |= {"flame_param_path": "flame_param/0.npz", "transform_matrix": np.eye(4).tolist()}
+    (folder / "transforms.json").write_text(json.dumps({"frames": [frame | values]}))
+    return read_transforms(folder / "transforms.json")[0]
+
+
 def test_paths_with_backslashes_and_a_byte_order_mark_are_read(capture):
     path = capture.union / "transforms_train.json"
     expected = [(entry.image, entry.mask, entry.parameters) for entry in read_transforms(path)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.ga.writer import CaptureWriter
+from headbench.datasets.ga.writer import CaptureWriter, write_union
 
 from ..tiny_capture import FRONTAL, make_plan, paint
 
@@ -136,3 +136,21 @@ def test_a_plan_that_does_not_hold_together_is_refused(change, key):
     with pytest.raises(InputError) as error:
         make_plan(**change)
     assert error.value.key == key
+
+
+def test_a_union_joins_sequences_with_absolute_paths(capture):
+    """Its own paths are relative, as in every union."""
+    folders = [
+        capture.writer.sequence_folder(sequence.name) for sequence in capture.writer.plan.sequences[:2]
+    ]
+    for folder in folders:
+        document = read(folder / "transforms.json")
+        for frame in document["frames"]:
+            frame |= {key: str(folder / frame[key]) for key in frame if key.endswith("_path")}
+        (folder / "transforms.json").write_text(json.dumps(document))
+    union = capture.union.with_name("UNION_again")
+    write_union(union, folders[:1], folders[1:], [], None)
+    for frame in read(union / "transforms_test.json")["frames"]:
+        for key in ("file_path", "fg_mask_path", "flame_param_path"):
+            assert frame[key].startswith(f"../{folders[1].name}/")
+            assert (union / frame[key]).is_file()

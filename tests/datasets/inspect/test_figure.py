@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.figures import HELD_OUT, TRAIN, hexadecimal, new_figure, pixels
+from headbench.bench.io.figures import pixels
+from headbench.datasets.figures import HELD_OUT, TRAIN, hexadecimal, new_figure
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.inspect.command import NUMBERS, PICTURE, InspectSettings, inspect
 from headbench.datasets.inspect.figure import (

@@ -125,6 +125,13 @@ def _soil(image, mask):
     return np.where(spots[..., None], 180, image).astype(np.uint8)
 
 
+def _room(good):
+    """Behind the subject, which no mask separates from it."""
+    shades = np.linspace(60, 200, HEIGHT)[:, None, None]
+    good.each_image(lambda image, mask: np.where(mask[..., None] == 0, shades, image).astype(np.uint8))
+    good.without_masks()
+
+
 def _premultiply_again(image, mask):
     alpha = mask[..., None].astype(float) / 255
     added = image - (1 - alpha) * 255
@@ -377,6 +384,7 @@ CAPTURES = (
         Fault("HB701", _parameters(lambda a, i: a["translation"].__iadd__(0.04))),
     ),
     (Fault("HB402", _images(lambda image, mask: image // 255)),),
+    (Fault("HB309", _room, ("HB403",)),),
     (
         Fault("HB405", _tint_one_camera),
         Fault("HB702", _shift_one_camera),

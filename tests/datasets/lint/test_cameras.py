@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Camera
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.ga.writer import SequencePlan
 from headbench.datasets.images import read_image
+from headbench.datasets.lint.before_run import errors
+from headbench.datasets.lint.catalogue import RULES
 from headbench.datasets.lint.command import lint_capture
 from headbench.datasets.lint.settings import LintSettings
 
@@ -173,6 +176,8 @@ def test_a_fault_of_one_camera_is_found_and_named(fault: CameraFault, painted, t
     assert set(found) == {fault.code}, "the fault, and nothing that follows from it"
     named = {camera.id for camera in arc(6) if camera.id in found[fault.code]}
     assert named == ({CAMERA, OTHER} if fault.code == "HB513" else {CAMERA})
+    before_run = [error[:5] for error in errors(read_capture(capture.union))]
+    assert before_run == [rule.code for rule in RULES if rule.code == fault.code and rule.severity == "error"]
 
 
 @pytest.mark.parametrize("noise", [True, False])

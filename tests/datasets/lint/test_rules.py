@@ -9,8 +9,10 @@ import pytest
 
 from headbench.bench.io.images import ImageInfo
 from headbench.datasets.ga.layout import Declaration
+from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.ga.writer import SequencePlan
 from headbench.datasets.head.arrays import save_head
+from headbench.datasets.lint.before_run import errors
 from headbench.datasets.lint.catalogue import GROUPS, RULES
 from headbench.datasets.lint.command import lint_capture
 from headbench.datasets.lint.rules import apply
@@ -85,6 +87,7 @@ def test_a_point_off_the_centre_and_cy_from_the_other_edge(tmp_path):
     replace(Declaration.read(capture.union), cy="top").write(capture.union)
     found = codes(capture, **SHORT)
     assert "HB511" in found
+    assert any(error.startswith("HB511: ") for error in errors(read_capture(capture.union)))
     assert set(found) <= {"HB511", "HB510", "HB702", "HB701"}
     assert codes(capture, cy="bottom", **SHORT) == ["HB510"]
 
@@ -92,10 +95,12 @@ def test_a_point_off_the_centre_and_cy_from_the_other_edge(tmp_path):
 def test_a_width_beyond_the_limit_of_gaussian_avatars(pristine):
     evidence, _ = lint_capture(LintSettings(str(pristine.union), views=1, duplicates=0))
     path = next(iter(evidence.headers))
-    wide = replace(evidence, headers={path: ImageInfo(1604, 2000, 3)})
+    of_width = lambda width: replace(
+        evidence, pixels=replace(evidence.pixels, headers={path: ImageInfo(width, 2000, 3)})
+    )
     rule = next(rule for rule in RULES if rule.code == "HB115")
-    assert len(apply([rule], wide)) == 1
-    assert apply([rule], replace(evidence, headers={path: ImageInfo(1600, 2000, 3)})) == []
+    assert len(apply([rule], of_width(1604))) == 1
+    assert apply([rule], of_width(1600)) == []
 
 
 def test_alpha_in_the_image_is_a_mask_and_has_no_background(good):

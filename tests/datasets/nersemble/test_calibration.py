@@ -86,6 +86,11 @@ def test_per_camera_intrinsics_mean_the_images_as_they_are(file):
         np.testing.assert_array_equal(calibration.camera(serial, (32, 40), (32, 40)).K, matrix)
 
 
+def test_the_size_may_be_stated_as_floats(file):
+    """As scripts write it that take it from a video's properties."""
+    assert read_calibration(write(file, width=float(WIDTH), height=float(HEIGHT))).size == (WIDTH, HEIGHT)
+
+
 def test_other_shapes_and_opposite_cameras_are_refused(file):
     calibration = read_calibration(write(file))
     with pytest.raises(InputError, match="64x48"):
@@ -117,6 +122,8 @@ K = [[100.0, 0, 24], [0, 100, 32], [0, 0, 1]]
         ({"height": 0}, "height"),
         ({"width": None}, "width"),
         ({"width": True}, "width"),
+        ({"width": 1.5}, "width"),
+        ({"width": 10**400}, "width"),
     ],
 )
 def test_a_faulty_calibration_names_the_entry(change, key, file):

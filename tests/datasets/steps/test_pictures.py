@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
-from headbench.datasets.figures import new_figure, pixels
+from headbench.bench.io.figures import pixels
+from headbench.datasets.figures import new_figure
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.steps.figures import (
     cluster_colour,
