@@ -141,8 +141,8 @@ def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.nd
 def paint(plan: CapturePlan, pose: HeadPose, camera: Camera, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Image (noise and a gradient inside the silhouette, white outside) and mask of a frame."""
     covered = silhouette(posed_vertices(plan, pose), plan.head.faces, camera)
-    noise = np.random.default_rng(seed).integers(20, 140, size=(camera.height, camera.width, 3))
-    noise += np.linspace(0, 60, camera.height, dtype=int)[:, None, None]
+    noise = np.random.default_rng(seed).integers(20, 80, size=(camera.height, camera.width, 3))
+    noise += np.linspace(0, 120, camera.height, dtype=int)[:, None, None]
     image = np.where(covered[..., None], noise, 255).astype(np.uint8)
     return image, (covered * 255).astype(np.uint8)
 
