@@ -112,6 +112,7 @@ class Table:
     marking: str = ""
     starred: str = ""
     image_size: str = ""
+    cut: str = ""
     machine: str = ""
     part: str = ""
     missing: tuple[str, ...] = ()
@@ -155,7 +156,7 @@ class Table:
             parts.append(f"{task.title}: {task.size}, protocol {name}({task.protocol_hash}).")
         parts += [*self.missing, *filter(None, [self.cameras, self.part])]
         if self.image_size:
-            parts.append(f"Images of {self.image_size} pixels.")
+            parts.append(f"Images of {self.image_size} pixels{self.cut and f', {self.cut}'}.")
         spread = f"mean of {self.seeds} seeds ± standard deviation over seeds"
         seeds = spread if self.seeds > 1 else "one seed"
         if details:
@@ -220,6 +221,7 @@ def build_table(
     changed: Sequence[str] = (),
     protocol_ids: Mapping[str, str],
     image_size: str = "",
+    cut: str = "",
     machine: str = "",
     part: str = "",
     missing: Sequence[str] = (),
@@ -248,7 +250,7 @@ def build_table(
     keys : Mapping[str, Collection[FrameKey]] | None
         Frames of each task, if some scored frames have no rows.
     protocol_ids : Mapping[str, str]
-        Readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (if
+        Readable name of each task's protocol, for the caption, like ``image_size``, ``cut``, ``machine`` (if
         the rows do not record the machine that measured speed), ``part``, ``cameras``, ``averaged`` and
         the sentences of ``missing``.
     avatar_title : str
@@ -312,6 +314,7 @@ def build_table(
         marking=marking,
         starred=starred,
         image_size=image_size,
+        cut=cut,
         machine=measured_on(found.get("fps", {}), trivial, machine),
         part=part,
         missing=tuple(missing),

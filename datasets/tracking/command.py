@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import write_json
+from ...bench.manifest import cut_of
 from ...bench.progress import counted
 from ...bench.protocol import evenly_with_ends
 from ...bench.specs import CommandResult
@@ -35,6 +37,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
     from ..overlay import draw_overlay
+    from ..steps.masks import without_torso
     from ..tracking_errors import tracking_errors
     from ..video.command import video_to_track
     from ..video.decode import is_video
@@ -70,12 +73,17 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         )
     make_work_folder(work)
     tracked = track(clip, cameras, source, notes=notes, store=work, progress=progress)
+    if video is not None:
+        tracked = tracked._replace(
+            clip=without_torso(tracked.clip, settings.cut, settings.parsing, video.view.image)
+        )
     timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
     overlay = draw_overlay(tracked.clip, timesteps, evenly_with_ends(cameras, COLUMNS))
     write_image(out / PICTURE, overlay)
     union = write_capture(tracked.clip, out, progress)
     data: dict[str, Any] = {
         "capture": union.as_posix(),
+        "cut": cut_of(map(asdict, tracked.clip.steps)),
         **notes,
         **(video.data if video else {}),
         **tracked.report.to_json(),

@@ -52,7 +52,9 @@ class TrackSettings(VideoOptions, CaptureOptions):
     dependent = (
         DependentOptions(("landmarks", "embedding", "cameras", "against", "seed"), "program", ("light",)),
         DependentOptions(
-            ("segmentation", "masks", "focal", "rate", "longest", "size"), "program", ("light",)
+            ("segmentation", "masks", "cut", "parsing", "focal", "rate", "longest", "size"),
+            "program",
+            ("light",),
         ),
         DependentOptions(("python",), "checkout"),
     )

@@ -21,7 +21,7 @@ from ..tracking.embedding import Embedding
 from ..tracking.focal import FocalLength, estimate_focal
 from ..tracking.network import NetworkLandmarks, head_embedding
 from ..tracking.work import TRACKER_VERSION, make_work_folder
-from .clip import USUAL_FOCAL, VideoClip, open_video
+from .clip import USUAL_FOCAL, FrameView, VideoClip, open_video
 
 if TYPE_CHECKING:
     from ..tracking.settings import TrackSettings
@@ -31,9 +31,10 @@ _FOCAL = {"pixels": Member("f", ()), "residuals": Member("f", ("N",)), "tried": 
 
 
 class OpenedVideo(NamedTuple):
-    """A video to be tracked: its clip, its landmarks, and information about it as data and as lines of text."""
+    """A video to be tracked: its clip, the part of its frames there, its landmarks, and information as data and lines of text."""
 
     clip: CaptureClip
+    view: FrameView
     landmarks: NetworkLandmarks
     data: dict[str, Any]
     lines: list[str]
@@ -87,7 +88,7 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
             clip = video.with_focal(focal.pixels / video.view.scale)
             landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
     return OpenedVideo(
-        clip, landmarks, _data(video, settings.focal, focal), _lines(video, settings.focal, focal)
+        clip, video.view, landmarks, _data(video, settings.focal, focal), _lines(video, settings.focal, focal)
     )
 
 

@@ -76,7 +76,7 @@ class TexturedMeshAvatar:
         layer[hit, :3] = self._colors.reshape(-1, 3)[places] / np.float32(255)
         layer[hit, 3] = 1
         layer = cv2.resize(layer, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        alpha = layer[..., 3]
+        alpha: FloatArray = layer[..., 3].astype(np.float32)
         return Frame(layer[..., :3] + (1 - alpha[..., None]) * np.asarray(background, np.float32), alpha)
 
 
@@ -113,7 +113,7 @@ class TexturedMesh(TrainedMethod[None, TexturedMeshAvatar]):
         finish_fit(fit, TrainingSummary(images, images, 0.0), Subject.of(clip), clip.head)
 
 
-class Samples(NamedTuple):
+class MeshSamples(NamedTuple):
     """N pixels of the subject on the posed mesh: number of the image, triangle, (N, 3) barycentric weights and 8-bit colours."""
 
     image: IntArray
@@ -122,12 +122,12 @@ class Samples(NamedTuple):
     colors: ByteArray
 
 
-def _samples(fit: Fit, mesh: PosedSubject) -> Samples:
+def _samples(fit: Fit, mesh: PosedSubject) -> MeshSamples:
     clip = fit.clip
     keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
     pixels = max(camera.width * camera.height for camera in clip.cameras.values())
     keys = evenly_with_ends(keys, max(1, SAMPLES // pixels))
-    parts: list[Samples] = []
+    parts: list[MeshSamples] = []
     for number, key in enumerate(keys):
         (vertices,) = mesh.meshes([clip.poses[key.timestep]])
         view = rasterize_mesh(vertices, np.asarray(clip.head.faces), clip.cameras[key.camera])
@@ -135,9 +135,9 @@ def _samples(fit: Fit, mesh: PosedSubject) -> Samples:
         if mask is not None:
             used &= mask >= FOREGROUND
         face = view.face[used]
-        parts.append(Samples(np.full(len(face), number), face, view.weights[used], clip.image(key)[used]))
+        parts.append(MeshSamples(np.full(len(face), number), face, view.weights[used], clip.image(key)[used]))
         fit.progress(number + 1, len(keys))
-    return Samples(*map(np.concatenate, zip(*parts)))
+    return MeshSamples(*map(np.concatenate, zip(*parts)))
 
 
 def texels(face: IntArray, weights: FloatArray, rows: int) -> IntArray:

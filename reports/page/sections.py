@@ -153,7 +153,7 @@ def _facts(runs: RunSet) -> list[tuple[str, str]]:
         ("Methods", "; ".join(filter(None, [", ".join(runs.ranked), changed, trivial]))),
         ("Subjects", ", ".join(sorted(runs.rows.subjects))),
         ("Frames", ", ".join(frames) + f"; {counted(len(cameras), 'camera')}" * bool(cameras)),
-        ("Images", f"{runs.image_size} pixels" * bool(runs.image_size)),
+        ("Images", f"{runs.image_size} pixels{runs.cut and f', {runs.cut}'}" * bool(runs.image_size)),
         ("Training", f"{presets}; {f'{iterations} iterations; ' * bool(iterations)}{seeds}"),
         ("Machine", ", ".join(filter(None, [runs.machine, cores and f"{cores} cores"]))),
         ("Results of", f"{when.day} {when:%B %Y}" if when else ""),
