@@ -26,6 +26,7 @@ from ..pareto.points import SIZE, SPEED
 from ..runs import RunData, RunSet
 from ..statistics.comparisons import subjects_needed
 from ..statistics.paired import LEVEL
+from ..tables import BELOW_CAUSES, not_better
 
 NAMED = 3
 """Maximum number of methods named in a title."""
@@ -55,6 +56,10 @@ def verdict(
     """
     found = Conclusions(_title(runs), facts=_facts(runs))
     methods = runs.ranked
+    tasks = runs.by_camera.tasks
+    if below := not_better(runs.by_camera.rows, metrics, methods, runs.trivial, tasks):
+        found.sentences += [Markup("<b>{}</b>").format(" ".join(below.values())), Markup.escape(BELOW_CAUSES)]
+    methods = tuple(name for name in methods if name not in below)
     for task in runs.by_camera.tasks if metrics else ():
         if scores := _scores(runs.by_camera, methods, metrics[0], task):
             found.sentences.append(_sentence(scores, metrics[0], task, comparisons))
