@@ -235,7 +235,7 @@ def table_of(
         image_size=runs.image_size,
         machine=runs.machine,
         part=runs.part if tasks else "",
-        missing=(*(runs.missing if tasks == runs.tasks else ()), *runs.mixed_code),
+        missing=(*(runs.missing if tasks == runs.tasks else ()), *runs.mixed_code, *runs.unchecked),
         cameras=runs.cameras if {SPLIT_TASK, SEEN_CAMERAS, UNSEEN_CAMERAS} & {*tasks} else "",
         keys=runs.keys,
         averaged=runs.averaged,
