@@ -140,7 +140,7 @@ class Rows:
         """Write the rows as Parquet, atomically."""
         repeated = [name for name in COLUMNS if name != "value"]
         with atomic_path(path) as temporary:
-            # Encodings and a compression that every reader of Parquet has had since 2013. Values rarely repeat.
+            # Encodings and a compression that every reader of Parquet has had since 2013; `value` is PLAIN.
             self._table.to_parquet(temporary, index=False, use_dictionary=repeated, compression="gzip")
 
     def __len__(self) -> int:

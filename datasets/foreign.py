@@ -24,9 +24,9 @@ RIG = (
     "folder of its export in GaussianAvatars' layout."
 )
 MONOCULAR = (
-    "The reader monocular, which commands choose by the content, reads complete folders: the output of INSTA's generate.sh for Metrical Tracker (transforms_train.json, "
-    "flame/exp, meshes, canonical.obj), and IMavatar's flame_params.json with its list of frames. A motion of LAM "
-    "(flame_params.json of arrays) is for `headbench drive`."
+    "The reader monocular reads complete folders: the output of INSTA's generate.sh for Metrical Tracker "
+    "(transforms_train.json, flame/exp, meshes, canonical.obj), and IMavatar's flame_params.json with its list of frames. "
+    "A motion of LAM (flame_params.json of arrays) is for `headbench drive`."
 )
 
 

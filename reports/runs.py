@@ -328,6 +328,12 @@ class RunSet:
         return ids | dict.fromkeys((SEEN_CAMERAS, UNSEEN_CAMERAS), ids.get(SPLIT_TASK, ""))
 
     @property
+    def unchecked(self) -> tuple[str, ...]:
+        """A sentence if captures were not searched for errors before a run."""
+        said = "The captures were not searched for errors before the run (--unchecked)."
+        return (said,) if any(run.manifest.unchecked for run in self.runs) else ()
+
+    @property
     def missing(self) -> tuple[str, ...]:
         """A sentence for each requested task that no run could measure."""
         done = {task for run in self.runs for task in run.tasks}

@@ -30,7 +30,7 @@ from ..io.files import check_kind, check_output_folder
 from ..io.lock import locked
 from ..machine import check_device_answers, machine_record, peak_memory_bytes
 from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
-from ..progress import duration, run_progress
+from ..progress import counted, duration, run_progress
 from ..protocol import TASK_TITLES, Protocol, make_protocols, missing_tasks
 from ..registry import discover, get, resolve
 from ..rows import DISCARD, Rows
@@ -142,7 +142,10 @@ def _run(
     known: set[str] = set()
     with suppress(InputError):  # of a new run, or of one whose record is damaged
         earlier = folder.read_manifest()
-        known, unchecked = {clip.fingerprint for clip in earlier.clips}, unchecked or bool(earlier.unchecked)
+        known = {clip.fingerprint for clip in earlier.clips}
+        if earlier.unchecked and not unchecked:
+            unchecked = True
+            log.warning("The captures are not searched for errors, as this run was begun with --unchecked.")
     if not config.drive:
         warn_of_missing_metrics(metrics, clips[0])
     if not unchecked and not config.source:
@@ -380,7 +383,7 @@ def check_capture(config: RunConfig, clip: Clip) -> None:
             config.data,
             f"capture of {clip.subject}",
             "a capture without errors that change results",
-            " ".join(found).rstrip("."),
+            found[0].rstrip(".") + (f"; and {counted(len(found) - 1, 'other error')}" if found[1:] else ""),
             "`headbench lint` shows more; `headbench run --unchecked` trains all the same.",
         )
 

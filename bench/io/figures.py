@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from typing import Any
 
@@ -19,7 +20,8 @@ LONGEST = 2**16 - 1
 def drawable(text: str, font: FontProperties | None = None) -> str:
     """The text, with code points such as U+5F20 for characters that a font lacks; by default matplotlib's."""
     known = _characters(findfont(font or FontProperties()))
-    return "".join(c if ord(c) in known or c == "\n" else f"U+{ord(c):04X}" for c in text)
+    written = "".join(c if ord(c) in known or c == "\n" else f"U+{ord(c):04X}" for c in text)
+    return re.sub(r"(U\+[0-9A-F]{4,6})(?=U\+)", r"\1 ", written)
 
 
 @cache

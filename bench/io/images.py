@@ -143,7 +143,9 @@ def _header(path: Path, stream: BinaryIO) -> ImageInfo:
 def _png_info(path: Path, image: Image.Image, head: bytes) -> ImageInfo:
     depth, colour = head[24], head[25]
     if depth > 8:
-        raise InputError(path, "", "8 bits per channel", f"bit depth {depth}, colour type {colour}")
+        raise InputError(
+            path, "", "8 bits per channel", f"bit depth {depth}, colour type {colour}", "Save it with 8 bits."
+        )
     if getattr(image, "is_animated", False):
         raise InputError(path, "", "a single image", "an animated PNG", "Export its frames one by one.")
     channels, alpha = _PNG_CHANNELS[colour], image.info.get("transparency")

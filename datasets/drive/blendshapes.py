@@ -9,7 +9,7 @@ Formats read:
   (`utils/csv/save_csv.py`). Checked on alexdjulin/LiveLinkFace-CSV-Retarget-For-Motionbuilder@6492a4a1 `anim/alex_rom_3.csv`
   and AnimaVR/NeuroSync_Player@f31b8fad `livelink/animations/Sad/MySlate_167_iPhone_cal.csv`.
 - MediaPipe Face Landmarker results, JavaScript. Written by google-ai-edge/mediapipe
-  (`mediapipe/tasks/web/vision/face_landmarker`). Checked on UUoocl/UUhimsy@80429b75 `UUhimsy_Demo_Vault/_GUM/README.md`.
+  (`mediapipe/tasks/web/vision/face_landmarker`). Not checked on a file of the program.
 - MediaPipe Face Landmarker results, Python and Unity. Written by google-ai-edge/mediapipe
   (`mediapipe/tasks/python/vision/face_landmarker.py`) and homuler/MediaPipeUnityPlugin. Not checked on a file of the program.
 - Audio2Face-3D CSV. Written by NVIDIA/Audio2Face-3D-Samples

@@ -313,6 +313,7 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
             signal_head=settings.signal_head,
             map=settings.map,
             sequence=settings.sequence,
+            fps=settings.fps,
             options=settings,
             progress=progress,
         )

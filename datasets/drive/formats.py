@@ -260,32 +260,31 @@ FORMATS = (
     SignalFormat("mapped", "a table of numbers with --map", lambda table: False, read_mapped),
 )
 """In the order in which they are tried. A folder that a reader of captures finds is a capture, a table with a map is mapped."""
+_BY_NAME = {form.name: form for form in FORMATS}
 
 
 def read_signal(request: SignalRequest, name: str = "") -> DrivingSignal:
     """Read a signal in the named format, or in the one that recognises it."""
-    formats = {form.name: form for form in FORMATS}
-    if name and name not in formats:
-        raise unknown("command line", "--form", name, [*formats])
+    if name and name not in _BY_NAME:
+        raise unknown("command line", "--form", name, [*_BY_NAME])
     path = request.path
     if not path.exists():
         raise InputError(path, "", "a signal", "no such file or folder")
     known = readers().values() if path.is_dir() else ()
     if name == "capture" or (not name and not request.map and any(finds(spec, path) for spec in known)):
-        return formats["capture"].read(request)
+        return read_capture_signal(request)
     if request.sequence:
         raise InputError("command line", "--sequence", "a signal that is a capture", str(path))
-    return read_rows(replace(request, table=read_table(path)), name)
+    return read_rows(replace(request, table=read_table(path, request.fps)), name)
 
 
 def read_rows(request: SignalRequest, name: str = "") -> DrivingSignal:
     """Read the signal of a request with a table, as `read_signal` does."""
-    formats = {form.name: form for form in FORMATS}
     if request.map or name == "mapped":
         if not request.map or name not in ("", "mapped"):
             expected = "--form mapped" if request.map else "the map of --form mapped"
             raise InputError("command line", "--map", expected, f"--form {name}")
-        return formats["mapped"].read(request)
+        return read_mapped(request)
     fitting = [form for form in FORMATS if form.fits(request.columns)]
     if not name and not fitting:
         expected = "; ".join(f"{form.name}: {form.summary}" for form in FORMATS)
@@ -293,4 +292,4 @@ def read_rows(request: SignalRequest, name: str = "") -> DrivingSignal:
         raise InputError(
             request.path, "columns", expected, found, "Name other columns in a map file: --map FILE.yaml."
         )
-    return (formats[name] if name else fitting[0]).read(request)
+    return (_BY_NAME[name] if name else fitting[0]).read(request)

@@ -70,6 +70,7 @@ class SignalRequest:
     signal_head: str = ""
     map: str = ""
     sequence: str = ""
+    fps: float | None = None
     options: CaptureOptions = field(default_factory=CaptureOptions)
     progress: Progress = no_progress
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,11 +19,11 @@ import numpy as np
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy, read_npz
-from ...bench.io.documents import parse_json, read_json, read_text, shown
+from ...bench.io.documents import parse_json, read_text, shown
 from ...bench.io.files import reading, user_files
 from ..foreign import describe
 from .names import IDENTITY, NAMES
-from .timing import Timing, from_columns, in_order
+from .timing import Timing, from_columns, in_order, is_empty
 
 _CATEGORY_NAMES, _SCORE = ("categoryName", "category_name"), "score"
 """Keys of MediaPipe's categories in its JavaScript, Java and C#, and in its Python."""
@@ -35,8 +36,9 @@ _COUNT, _SUCCESS = "blendshapecount", "success"
 
 _NAMES, _WEIGHTS = ("facsNames", "names"), ("weightMat", "weights")
 """Keys of the names of blendshapes and of their values, of Audio2Face in a document and of LAM in each frame."""
-_RATES = ("exportFps", "fps", "frame_rate", "frameRate")
-"""Keys of the frames per second, in a document or its metadata."""
+_RATES, _METADATA = ("exportfps", "fps", "framerate"), ("metadata", "meta")
+"""Keys of the frames per second, in lower case without ``_``, and of the objects of a document that may have them too."""
+MOST_FPS = 1000
 
 _FRAMES = "frames"
 """Key of a JSON document with a list of frames."""
@@ -70,11 +72,11 @@ class SignalTable:
         """The rows with a value in any of the columns ``names``, and without ``success`` 0; all of them if that is none."""
         columns = [self.columns[name] for name in names]
         tracked = [column for name, column in self.columns.items() if name.lower() == _SUCCESS]
-        if any(len(column) != len(self) for column in self.columns.values()):
+        if any(len(column) != len(self) for column in (*columns, *tracked)):
             return self
         rows = [
-            not all(_is_empty(column[row]) for column in columns)
-            and not any(str(column[row]).strip() in ("0", "0.0", "False") for column in tracked)
+            not all(is_empty(column[row]) for column in columns)
+            and not any(str(column[row]).strip().lower() in ("0", "0.0", "false") for column in tracked)
             for row in range(len(self))
         ]
         if all(rows) or not any(rows):
@@ -83,9 +85,13 @@ class SignalTable:
         chosen = {
             name: column[kept] if isinstance(column, np.ndarray) else [column[row] for row in kept]
             for name, column in self.columns.items()
+            if len(column) == len(self)
         }
         return replace(
-            self, columns=chosen, places=[self.places[row] for row in kept], timing=self.timing.where(rows)
+            self,
+            columns={**self.columns, **chosen},
+            places=[self.places[row] for row in kept],
+            timing=self.timing.where(rows),
         )
 
     def values(self, name: str) -> FloatArray:
@@ -138,32 +144,39 @@ class SignalTable:
             raise InputError(self.path, f"{name}, {place}", expected, found) from None
 
 
-def _is_empty(value: Any) -> bool:
-    """Whether a value is none: null, an empty list or text, or NaN throughout."""
-    if isinstance(value, (np.ndarray, np.floating)):
-        return value.dtype.kind == "f" and bool(np.isnan(value).all())
-    return value is None or value == [] or (isinstance(value, str) and value.strip().lower() in ("", "nan"))
-
-
-def read_table(path: Path) -> SignalTable:
+def read_table(path: Path, fps: float | None = None) -> SignalTable:
     """Read a file by its ending, or a folder with files of each frame. Times are those of a column, if there are any.
+
+    With ``fps``, frames per second, a column of times that gives no rate is no error.
 
     Raises `InputError` for another ending, a damaged or empty file, and frames with unequal columns.
     """
     read = _folder if path.is_dir() else _READERS.get(path.suffix.lower())
     if read is None:
         expected = f"a file in {', '.join(_READERS)}, or a folder"
-        raise InputError(path, "", expected, *describe(path))
+        found, remedy = describe(path)
+        if found == "a file":
+            found, remedy = f"a file in {path.suffix or path.name}", "Save the signal as npz or CSV."
+        raise InputError(path, "", expected, found, remedy)
     table = read(path)
     if not len(table) or not table.columns:
         raise InputError(path, "", "at least one frame with values", "none")
-    timing = from_columns(path, dict(table.columns), table.places)
-    return table if timing is None else replace(table, timing=timing)
+    stated = table.timing.fps
+    timing = from_columns(path, table.columns, table.places, bool(fps or stated))
+    return table if timing is None else replace(table, timing=replace(timing, fps=timing.fps or stated))
 
 
 def parse_line(text: str, path: Path, place: str) -> dict[str, Any]:
-    """Columns of one line of JSON; MediaPipe's lists of categories become one column each."""
+    """Columns of a frame in JSON; MediaPipe's lists of categories become one column each."""
+    text = "{}" if text.strip() == "null" else _without_nan(text)
     return _expanded(parse_json(text, path, place), path, place)
+
+
+def _without_nan(text: str) -> str:
+    """JSON with null for NaN, which Python writes and JSON does not have."""
+    return (
+        re.sub(r'("(?:[^"\\]|\\.)*")|NaN', lambda match: match[1] or "null", text) if "NaN" in text else text
+    )
 
 
 def _expanded(frame: Mapping[str, Any], path: Path, place: str, names: Sequence[str] = ()) -> dict[str, Any]:
@@ -179,8 +192,8 @@ def _expanded(frame: Mapping[str, Any], path: Path, place: str, names: Sequence[
         scores = [_categories(face) for face in faces]
         if isinstance(value, dict) and scores[0] is None:
             line |= _expanded(value, path, place)
-        elif name in _WEIGHTS and names and isinstance(value, list) and len(value) == len(names):
-            line |= zip(names, value)
+        elif name in _WEIGHTS and names:
+            line |= _weights(value, path, f"{place}, {name}", names)
         elif scores and scores[0] is not None:
             if len(scores) > 1:
                 remedy = "Track one face, or keep the entry of one."
@@ -189,6 +202,14 @@ def _expanded(frame: Mapping[str, Any], path: Path, place: str, names: Sequence[
         elif value or name.lower() not in _FACES:
             line[name] = value
     return line
+
+
+def _weights(row: Any, path: Path, place: str, names: Sequence[str]) -> dict[str, Any]:
+    """Values by name of a row of weights; none of an empty row. Raises `InputError` for another number of them."""
+    if not is_empty(row) and not (isinstance(row, list) and len(row) == len(names)):
+        found = str(len(row)) if isinstance(row, list) else shown(row)
+        raise InputError(path, place, f"{len(names)} values a row, as there are names", found)
+    return dict(zip(names, row or ()))
 
 
 def _categories(face: Any) -> dict[str, Any] | None:
@@ -215,10 +236,11 @@ def _csv(path: Path) -> SignalTable:
     if not rows:
         raise InputError(path, "", "a header and a line for each frame", "an empty file")
     names = [name.strip() for name in rows[0][1]]
-    names[0] = names[0] or "index"  # of pandas
-    for name in names:
-        if not name or names.count(name) > 1:
-            raise InputError(path, "header", "distinct names of columns", repr(name))
+    wrong = [name for name in names[1:] if not name or names.count(name) > 1]
+    wrong = names if re.match(r"sep=|[^,]*[;\t][^,]*$", ",".join(names)) else wrong
+    if wrong:
+        found = shown(wrong[0]) if wrong[0] else f"column {names.index('', 1) + 1} without a name"
+        raise InputError(path, "header", "distinct names of columns, separated by commas", found)
     count = next((index for index, name in enumerate(names) if name.lower() == _COUNT), None)
     for number, row in rows[1:]:
         if count is not None and [cell.strip() for cell in row[count : count + 1]] == ["0"]:
@@ -226,35 +248,39 @@ def _csv(path: Path) -> SignalTable:
         if len(row) != len(names):
             expected = f"{len(names)} values, as the header has names"
             raise InputError(path, f"line {number}", expected, str(len(row)))
-    columns = {name: [row[index] for _, row in rows[1:]] for index, name in enumerate(names)}
+    # the first column has no name if it is the index of pandas
+    columns = {name: [row[index] for _, row in rows[1:]] for index, name in enumerate(names) if name}
     return _table(path, columns, [f"line {number}" for number, _ in rows[1:]])
 
 
 def _json_lines(path: Path) -> SignalTable:
     lines = read_text(path, "JSON lines").splitlines()
-    places = [f"line {number}" for number, line in enumerate(lines, 1) if line.strip()]
-    return _joined(
-        path, places, [parse_line(line, path, f"line {n}") for n, line in enumerate(lines, 1) if line.strip()]
-    )
+    frames = {f"line {number}": line for number, line in enumerate(lines, 1) if line.strip()}
+    return _joined(path, [*frames], [parse_line(line, path, place) for place, line in frames.items()])
 
 
 def _json(path: Path) -> SignalTable:
     text = read_text(path, "JSON")
-    document = parse_json(f'{{"{_FRAMES}": {text}}}' if text.lstrip().startswith("[") else text, path)
+    key = "" if text.lstrip().startswith("[") else _FRAMES
+    document = parse_json(_without_nan(text if key else f'{{"{_FRAMES}": {text}}}'), path)
     frames, names = document.get(_FRAMES), _named(document, _NAMES, list) or []
-    fps = _rate(document) or _rate(_named(document, ("metadata",), dict) or {})
+    fps = _rate(path, document) or _rate(path, _named(document, _METADATA, dict) or {})
     if isinstance(frames, list):
-        for number, frame in enumerate(frames):
-            if not isinstance(frame, dict):
-                raise InputError(path, f"{_FRAMES}[{number}]", "an object", shown(frame))
-        places = [f"{_FRAMES}[{number}]" for number in range(len(frames))]
-        rows = [_expanded(frame, path, place, names) for frame, place in zip(frames, places)]
+        places = [f"{key}[{number}]" for number in range(len(frames))]
+        for frame, place in zip(frames, places):
+            if frame is not None and not isinstance(frame, dict):
+                raise InputError(path, place, "an object", shown(frame))
+        rows = [_expanded(frame or {}, path, place, names) for frame, place in zip(frames, places)]
         return _joined(path, places, rows, fps=fps)
     columns = {name: value for name, value in document.items() if isinstance(value, list)}
-    weights = _named(document, _WEIGHTS, list)
-    if names and weights and all(isinstance(row, list) and len(row) == len(names) for row in weights):
-        columns = {name: value for name, value in columns.items() if value not in (names, weights)}
-        columns |= {name: list(values) for name, values in zip(names, zip(*weights))}
+    if not columns and any(isinstance(v, dict) and next(iter(v), "").isdigit() for v in document.values()):
+        remedy = 'Of pandas, write to_json(orient="records").'
+        raise InputError(path, "", "an object of lists, or a list of objects", "an object of objects", remedy)
+    for key in _WEIGHTS if names else ():
+        if key in columns:
+            rows = [_weights(row, path, f"{key}[{n}]", names) for n, row in enumerate(columns[key])]
+            columns = {name: value for name, value in columns.items() if name not in (key, *_NAMES)}
+            columns |= {name: [row.get(name) for row in rows] for name in names}
     return _columns(path, columns, fps)
 
 
@@ -263,20 +289,21 @@ def _named(document: Mapping[str, Any], keys: Sequence[str], kind: type) -> Any:
     return next((document[key] for key in keys if isinstance(document.get(key), kind)), None)
 
 
-def _rate(document: Mapping[str, Any]) -> float | None:
-    """Frames per second that a document states."""
-    found = [
-        float(document[key]) for key in _RATES if isinstance(document.get(key), (int, float, np.ndarray))
-    ]
-    return next((fps for fps in found if fps > 0), None)
+def _rate(path: Path, document: Mapping[str, Any]) -> float | None:
+    """Frames per second that a document states. Raises `InputError` for none from 1 to `MOST_FPS`."""
+    for key, value in document.items():
+        value = value[0] if isinstance(value, list) and len(value) == 1 else value
+        if key.lower().replace("_", "") in _RATES and not is_empty(value) and not isinstance(value, list):
+            if re.fullmatch(r"\s*\d+(\.\d*)?\s*", str(value)) and 1 <= float(value) <= MOST_FPS:
+                return float(value)
+            raise InputError(path, key, f"frames per second, from 1 to {MOST_FPS}", shown(value))
+    return None
 
 
 def _npz(path: Path) -> SignalTable:
     arrays = read_npz(path)
-    scalars = {
-        name: values for name, values in arrays.items() if values.size == 1 and values.dtype.kind in "fiu"
-    }
-    return _columns(path, {name: values for name, values in arrays.items() if values.ndim}, _rate(scalars))
+    fps = _rate(path, {name: values.item() for name, values in arrays.items() if values.size == 1})
+    return _columns(path, {name: values for name, values in arrays.items() if values.ndim}, fps)
 
 
 def _columns(path: Path, columns: Mapping[str, Any], fps: float | None = None) -> SignalTable:
@@ -285,7 +312,7 @@ def _columns(path: Path, columns: Mapping[str, Any], fps: float | None = None) -
     rows = {
         name: values
         for name, values in moving.items()
-        if isinstance(values[0], list) or (isinstance(values[0], np.ndarray) and values[0].ndim)
+        if (values.ndim > 1 if isinstance(values, np.ndarray) else any(isinstance(v, list) for v in values))
     }
     if not rows and any(name in moving for name in NAMES["expression"]):
         return _table(path, {name: [values] for name, values in moving.items()}, ["frame 0"])
@@ -317,7 +344,7 @@ def _folder(path: Path) -> SignalTable:
     sources: Sequence[tuple[Sequence[Path], Callable[[Path], Mapping[str, Any]]]] = (
         (folders, lambda folder: {file.stem: read_npy(file) for file in user_files(folder, "*.npy")}),
         (user_files(path, "*.npz"), read_npz),
-        (user_files(path, "*.json"), lambda file: _expanded(read_json(file), file, "")),
+        (user_files(path, "*.json"), lambda file: parse_line(read_text(file, "JSON"), file, "")),
     )
     for found, read in sources:
         if found:

@@ -172,9 +172,7 @@ def resampled(
         steps = np.diff(positions, append=timing.last)
         longest = int(positions[steps.argmax()]) + 1
         expected = f"a face in half of its {total} frames or more"
-        found = (
-            f"{len(positions)}; the most are missing from frame {longest}, {round(steps.max() - 1)} of them"
-        )
+        found = f"{len(positions)}; longest gap: {round(steps.max() - 1)} frames from frame {longest}"
         raise InputError(path, timing.column, expected, found, "Keep a part of the signal without long gaps.")
     step = (timing.fps or fps) / fps
     times = step * np.arange(int(timing.last / step + ROUNDED) + 1)

@@ -165,10 +165,11 @@ def _check_intrinsics(path: Path, where: str, intrinsics: Mapping[str, float]) -
 
 
 def _sequence_folder(folder: Path, image: Path, parameters: Path) -> str:
-    """Name of the folder of the sequence's files: of ``flame_param``, else the innermost of image and parameters."""
+    """Name of the folder of the sequence's files: of ``flame_param``, else of ``images``, else the innermost of both files."""
     folder, image, parameters = (Path(os.path.abspath(path)) for path in (folder, image, parameters))
-    if parameters.parent.name == TRACKING_FOLDER:
-        return parameters.parent.parent.name
+    for file, usual in ((parameters, TRACKING_FOLDER), (image, "images")):
+        if file.parent.name == usual:
+            return file.parent.parent.name
     shared = Path(os.path.commonpath([image, parameters]))
     return folder.name if folder.is_relative_to(shared) else shared.name
 

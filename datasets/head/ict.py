@@ -92,17 +92,15 @@ def read_ict(path: Path) -> dict[str, np.ndarray]:
     indices = read_json(folder / INDICES)
     with reading(folder / INDICES, "lists of vertices by name"):
         landmarks = np.array(indices["idx_to_landmark_verts"], np.int64)
-    identities = [deltas[name] for name in shapes if name.startswith("identity")]
+    identities = [name for name in shapes if name.startswith("identity")]
     return {
         "v_neutral": neutral,
         "tri_v": triangles,
         "tri_material": np.array([sorted({*materials}).index(name) for name in materials]),
         "material_names": np.array(sorted({*materials})),
         "expr_names": np.array(expressions),
-        "expr_deltas": np.stack([deltas[name] for name in expressions])
-        if expressions
-        else np.zeros((0, 0, 3)),
-        "id_deltas": np.stack(identities) if identities else np.zeros((0, *neutral.shape)),
+        "expr_deltas": np.array([deltas[name] for name in expressions]).reshape(-1, *neutral.shape),
+        "id_deltas": np.array([deltas[name] for name in identities]).reshape(-1, *neutral.shape),
         "idx_to_landmark_verts": landmarks,
     }
 

@@ -216,7 +216,7 @@ def flame_version(path: Path) -> str:
     if folder and (not years or stem == "generic_model"):
         years.add(folder[1])
     if years == {"2023"}:
-        return "flame2023_no_jaw" if "no_jaw" in stem else OPEN if "open" in stem else "flame2023"
+        return "flame2023_no_jaw" if "no_jaw" in stem else "flame2023"
     if years == {"2020"}:
         return "flame2020"
     expected = "a name with FLAME's version (generic_model.pkl, flame2020.pkl, flame2023.pkl)"
@@ -230,7 +230,7 @@ def _content_version(path: Path, content: Mapping[str, Any], stated: str | None)
     if OPEN_KEY not in content:
         return stated or flame_version(path)
     if stated not in (None, OPEN):
-        remedy = f"The key {OPEN_KEY} is that of FLAME 2023 Open, whose coefficients are not interchangeable with theirs."
+        remedy = f"The key {OPEN_KEY} is that of FLAME 2023 Open, a model with coefficients of its own."
         raise InputError(path, "version", repr(stated), repr(OPEN), remedy)
     return OPEN
 

@@ -1,4 +1,4 @@
-"""The search for errors of a capture before a run: all that change results and that the reader does not refuse."""
+"""The linter's errors that are checked before a run: those that change results and that no reader refuses."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ SPLITS = "HB2"
 def errors(clip: Clip) -> list[str]:
     """Code, fault, file and remedy of each error of the linter, from a part of the clip's frames.
 
-    Errors of the splits are left out if the reader was asked to record them. A capture without a head model in FLAME's
-    layout, for methods that need none, has none.
+    Errors of the splits are left out if the reader was asked to record them. Captures without a head model in FLAME's layout
+    are not checked.
     """
     if not isinstance(clip.head, HeadAsset):
         return []

@@ -5,7 +5,7 @@ Formats read:
 - Masks of the frames of a video. Written by PeterL1n/RobustVideoMatting (`inference_utils.py`). Not checked on a file of
   the program.
 - Network of a person's mask. Written by google-ai-edge/mediapipe 0.10.21. Checked on
-  `mediapipe/modules/selfie_segmentation/selfie_segmentation.tflite` of its wheel.
+  its wheel, `mediapipe/modules/selfie_segmentation/selfie_segmentation.tflite`.
 """
 
 from __future__ import annotations

@@ -106,6 +106,8 @@ def _decoded(path: Path) -> Iterator[tuple[float, ByteArray]]:
         ratio = float(stream.sample_aspect_ratio or 1)
         if stream.codec_context.color_trc in HDR or stream.codec_context.color_primaries == BT2020:
             raise _refused(path, "colours", "those of BT.709 or BT.601", "HDR or BT.2020", TO_SDR)
+        if stream.metadata.get("alpha_mode") == "1":  # WebM, whose second layer is not decoded
+            raise _refused(path, "alpha", "opaque frames", "transparent ones", _OPAQUE)
         first, now, count = None, 0.0, 0
         for frame in _frames(container, stream):
             now = step * count if frame.time is None else float(frame.time)
@@ -117,6 +119,11 @@ def _decoded(path: Path) -> Iterator[tuple[float, ByteArray]]:
             remedy = "The file is damaged. Convert it again, for example with ffmpeg."
             found = f"{now - first + step:.3g} s, {count} frames"
             raise InputError(path, "", f"{seconds:.3g} s, as the file states", found, remedy)
+
+
+_OPAQUE = (
+    'ffmpeg -i IN -filter_complex "color=white[b];[b][0]scale2ref[b][v];[b][v]overlay=shortest=1" OUT.mp4'
+)
 
 
 def _frames(container: Any, stream: Any) -> Iterator[Any]:
@@ -133,11 +140,10 @@ def _picture(path: Path, frame: Any, ratio: float) -> ByteArray:
     """(H, W, 3) RGB of a frame whose pixels are ``ratio`` times as wide as high, upright and with square pixels."""
     if frame.interlaced_frame:
         remedy = "ffmpeg -i IN -vf bwdif=mode=send_frame OUT.mp4"
-        raise _refused(path, "frames", "whole ones", "interlaced fields", remedy)
+        raise _refused(path, "frames", "progressive frames", "interlaced ones", remedy)
     parts = frame.format.components
     if any(part.is_alpha for part in parts) and frame.to_ndarray(format="rgba")[..., 3].min() < 255:
-        remedy = 'ffmpeg -i IN -filter_complex "color=white[b];[b][0]scale2ref[b][v];[b][v]overlay=shortest=1" OUT.mp4'
-        raise _refused(path, "alpha", "opaque frames", "transparent pixels", remedy)
+        raise _refused(path, "alpha", "opaque frames", "transparent pixels", _OPAQUE)
     if max(part.bits for part in parts) > 8:
         image = np.rint(frame.to_ndarray(format="rgb48le") / 257).astype(np.uint8)
     else:

@@ -509,7 +509,7 @@ def formats_page() -> str:
     return (
         "# Formats of other programs\n\n"
         f"{sum(bool(one.checked) for one in known)} of {len(known)} formats were checked on a file that the program wrote: it was read, "
-        "and units, signs, order and rate of the values were compared with the code of the program. The others were written from the "
+        "and its values were compared with what the program means by them. The others were written from the "
         "code or the description of the program, as no file of it was public; a report with such a file is welcome.\n\n"
         + table(("format", "written by", "checked on", "reader"), rows)
     )

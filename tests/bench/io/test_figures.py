@@ -13,7 +13,7 @@ from headbench.bench.io.figures import drawable, pixels
     ("text", "drawn"),
     [
         ("naïve Ωλ → – ±", "naïve Ωλ → – ±"),
-        ("张三 a", "U+5F20U+4E09 a"),
+        ("张三 a", "U+5F20 U+4E09 a"),
         (
             "\N{GRINNING FACE WITH SMILING EYES}\nb",
             "\N{GRINNING FACE WITH SMILING EYES}\nb",

@@ -185,9 +185,18 @@ def live_link(path):
     for frame in range(FRAMES):
         values = dict(zip(SHAPES, VALUES[frame]))
         cells = [f"{values.get(name, 0.0):.9f}" for name in ARKIT]
-        lines.append(",".join([f"00:00:01:{frame:02d}.500", "61", *cells, "0.1"]))
+        lines.append(
+            ",".join(
+                [
+                    f"00:00:{1 + frame // 2:02d}:{58 * (1 - frame // 2) + frame % 2:02d}.500",
+                    "61",
+                    *cells,
+                    "0.1",
+                ]
+            )
+        )
     path.with_suffix(".csv").write_text("\n".join(lines))
-    unused = {"Timecode", "BlendShapeCount", "HeadYaw", "mouthShrugUpper", "tongueOut"}
+    unused = {"BlendShapeCount", "HeadYaw", "mouthShrugUpper", "tongueOut"}
     return path.with_suffix(".csv"), unused
 
 

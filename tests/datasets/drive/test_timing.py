@@ -1,6 +1,7 @@
 """Times, gaps and lost faces: in every format the jaw opens at a constant rate, which the poses keep to."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -73,6 +74,20 @@ WEIGHTS = [[0.0, SPEED * t / 60] for t in range(9)]
 NAMES = ["browInnerUp", "jawOpen"]
 LAM = [{"weights": row, "time": t / 60, "rotation": []} for t, row in enumerate(WEIGHTS)]
 SCREEN = 0.04 * np.arange(101) + 0.012 * (np.arange(101) % 2)
+CLOCKS = [f"00:00:00.{40 * t:03d},{SPEED * t / 25}" for t in range(9)]
+DATES = [
+    f"2024-05-0{1 + t // 6}T{'00:00:00' if t > 5 else '23:59:59'}.{(760 + 40 * t) % 1000:03d}Z,{SPEED * t / 25}"
+    for t in range(9)
+]
+
+
+def listed(lost=None, **keys):
+    """An object of lists, in which frame 4 has ``lost`` if it is given, with more keys."""
+    step = SPEED / next((float(np.ravel(v)[0]) for v in keys.values() if not isinstance(v, dict)), 60)
+    jaw = [t * step if lost is None or t != 4 else lost for t in range(9)]
+    return "a.json", json.dumps({"jawOpen": jaw, **keys})
+
+
 FILES = {
     "Live Link Face, three rows without a face": (
         timecodes(range(0, 80, 2), lost=(12, 13, 14)),
@@ -88,7 +103,43 @@ FILES = {
     "NeuroSync's rounded timecode": (neurosync(), 60, 150, []),
     "milliseconds": (stamps("timestampMs", 1e-3, np.arange(20) / 60), 60, 20, []),
     "microseconds": (stamps("timestamp", 1e-6, np.arange(20) / 30), 30, 20, []),
-    "seconds": (stamps("Time (s)", 1.0, np.arange(1, 20)), None, 19, None),
+    "seconds": (csv("Time (s),jawOpen", [f"{t / 4},{SPEED * t / 4}" for t in range(9)]), 4, 9, []),
+    "clock times": (csv("time,jawOpen", CLOCKS), 25, 9, []),
+    "minutes and seconds": (csv("time,jawOpen", [row[3:] for row in CLOCKS]), 25, 9, []),
+    "dates over midnight": (csv("time,jawOpen", DATES), 25, 9, []),
+    "a time missing with the face": (
+        csv("time,jawOpen", [*CLOCKS[:4], "nan,", *CLOCKS[5:]]),
+        25,
+        9,
+        [(4, 4)],
+    ),
+    "the last time missing": (csv("time,jawOpen", [*CLOCKS[:8], "nan,"]), 25, 9, [(8, 8)]),
+    "rate as text": (listed(frameRate="29.97"), 29.97, 9, []),
+    "rate in meta": (listed(meta={"fps": 60}), 60, 9, []),
+    "rate in capitals": (listed(FPS=60), 60, 9, []),
+    "rate in a list": (listed(fps=[30]), 30, 9, []),
+    "NaN": (listed(lost=math.nan, fps=50), 50, 9, [(4, 4)]),
+    "frames that are null": (
+        ("a.json", json.dumps([python(t, 25) if t != 3 else None for t in range(6)])),
+        None,
+        6,
+        [(3, 3)],
+    ),
+    "lines that are null": (lines([python(t, 25) if t != 3 else None for t in range(6)]), None, 6, [(3, 3)]),
+    "success in lower case": (
+        csv(
+            "success,jawOpen", [f"{str(t != 2).lower()},{SPEED * t / 25 if t != 2 else 9}" for t in range(6)]
+        ),
+        None,
+        6,
+        [(2, 2)],
+    ),
+    "pandas' index and a column index": (
+        csv(",index,jawOpen", [f"{t},{t},{SPEED * t / 25}" for t in range(4)]),
+        None,
+        4,
+        [],
+    ),
     "irregular times": (stamps("time_ms", 1e-3, SCREEN), 25, 101, []),
     "frame numbers": (stamps("frame", 0.04, np.delete(np.arange(9) / 25, [4])), None, 9, [(4, 4)]),
     "every fifth frame": (stamps("frame_id", 0.008, np.arange(9) / 25), None, 9, []),
@@ -143,8 +194,6 @@ def test_the_jaw_opens_at_the_rate_of_the_file(tmp_path, name):
     file, fps, count, lost = FILES[name]
     signal, poses, filled = read(tmp_path, file)
     assert (signal.timing.fps, len(poses)) == (fps, count)
-    if lost is None:  # times that are no times of frames
-        return
     assert filled == lost
     ends = signal.timing.positions[-1]  # held from the last frame with a face
     wanted = JAW_OPEN * SPEED * np.minimum(np.arange(count), ends) / (fps or 25)
@@ -195,6 +244,21 @@ def test_names_give_the_frame_and_the_face(tmp_path, kind):
         read_signal(request)
 
 
+@pytest.mark.parametrize("extra", ["000002_1", "000002 (1)"])
+def test_a_copy_of_a_frame_is_a_second_face(tmp_path, extra):
+    folder_of(tmp_path, "json", ["000000", "000001", "000002"])
+    (tmp_path / f"{extra}.json").write_text((tmp_path / "000002.json").read_text())
+    with pytest.raises(InputError, match="000002.*json and 000002.*json; more than one of frames 2"):
+        read_signal(SignalRequest(tmp_path, TOY, signal_head="avatar"))
+
+
+def test_a_given_rate_replaces_times_that_give_none(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time,frame,jawOpen\nnow,1,0\nthen,2,0\nlater,4,0\n")
+    timing = read_signal(SignalRequest(path, HEAD, fps=60)).timing
+    assert (timing.fps, timing.positions.tolist()) == (None, [0, 1, 3])
+
+
 def test_frames_without_a_face_in_other_tables(tmp_path):
     """NaN in arrays, and OpenFace's column ``success``, whose rows have values."""
     jaw = np.zeros((5, 3))
@@ -212,8 +276,8 @@ def test_frames_without_a_face_in_other_tables(tmp_path):
 
 
 REFUSED = {
-    "mostly lost": (timecodes(range(40), lost=range(5, 30)), "a face in half of its 40 frames"),
-    "hours missing": (timecodes([*range(90), 1000]), "the most are missing from frame 90"),
+    "mostly lost": (timecodes(range(40), lost=range(5, 30), start=30), "a face in half of its 40 frames"),
+    "hours missing": (timecodes([*range(90), 1000]), "91; longest gap: 910 frames from frame 90"),
     "two faces of MediaPipe": (
         lines([{"face_blendshapes": 2 * python(1)["face_blendshapes"]}]),
         "one face a frame",
@@ -226,6 +290,32 @@ REFUSED = {
         stamps("time", 1e-3, [0, 0.04, 0.08, 0.02, 0.06]),
         "time, line 5: expected a later",
     ),
+    "once a second": (stamps("time", 1.0, range(9)), "time: expected times at 2 to 240 frames a second"),
+    "words as times": (
+        csv("time,jawOpen", ["now,0", "then,0"]),
+        "found now, then. State the frame rate with --fps",
+    ),
+    "short timecode": (timecodes(range(9)), "timecodes of more than a second"),
+    "true as rate": (listed(fps=True), "fps: expected frames per second, from 1 to 1000"),
+    "a rate too high": (listed(fps=30000), "found 30000"),
+    "semicolons": (
+        csv("jawOpen;jawLeft", ["0;0"]),
+        "header: expected distinct names of columns, separated by commas",
+    ),
+    "tabs": (csv("jawOpen\tjawLeft", ["0\t0"]), "separated by commas"),
+    "a comma at the end": (csv("jawOpen,", ["0,"]), "separated by commas, found column 2 without a name"),
+    "Excel's separator": (csv("sep=,", ["jawOpen,jawLeft", "0,0"]), "separated by commas, found 'sep='"),
+    "pandas' JSON by column": (("a.json", '{"jawOpen": {"0": 0, "1": 0}}'), 'to_json(orient="records")'),
+    "a name more than Audio2Face's weights": (
+        ("a.json", json.dumps({"facsNames": [*NAMES, "jawLeft"], "weightMat": WEIGHTS})),
+        "weightMat[0]: expected 3 values a row, as there are names, found 2",
+    ),
+    "a name more than LAM's weights": (
+        ("a.json", json.dumps({"names": [*NAMES, "jawLeft"], "frames": LAM})),
+        "frames[0], weights: expected 3 values a row, as there are names, found 2",
+    ),
+    "a list of lists": (("a.json", "[[1]]"), "a.json, [0]: expected an object"),
+    "coefficients in a pickle": (("a.pkl", ""), "found a file in .pkl. Save the signal as npz or CSV."),
     "half a face": (csv("jawOpen,jawLeft", ["0,0", "0,"]), "jawLeft, line 3: expected a number"),
 }
 

@@ -153,10 +153,18 @@ def test_entries_as_other_programs_write_them(tmp_path, key, value, attribute, e
     assert getattr(only_entry(tmp_path / "here", **{key: value}), attribute) == expected
 
 
-@pytest.mark.parametrize("image", ["../SEQ/images/0.png", "images/SEQ/0.png"])
-def test_the_sequence_folder_holds_images_and_parameters(tmp_path, image):
-    entry = only_entry(tmp_path, file_path=image, flame_param_path=image.replace("images", "tracked"))
-    assert entry.sequence_folder == ("SEQ" if image.startswith("..") else tmp_path.name)
+@pytest.mark.parametrize(
+    ("image", "parameters", "folder"),
+    [
+        ("../SEQ/images/0.png", "../SEQ/tracked/0.npz", "SEQ"),
+        ("images/SEQ/0.png", "tracked/SEQ/0.npz", "here"),
+        ("../SEQ/images/0.png", "../tracking/SEQ/0.npz", "SEQ"),
+    ],
+)
+def test_the_sequence_folder_holds_images_or_parameters(tmp_path, image, parameters, folder):
+    (tmp_path / "here").mkdir()
+    entry = only_entry(tmp_path / "here", file_path=image, flame_param_path=parameters)
+    assert entry.sequence_folder == folder
 
 
 def only_entry(folder, **values):

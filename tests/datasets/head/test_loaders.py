@@ -106,7 +106,6 @@ def test_flame_pickle(tmp_path, legacy):
     [
         *(("generic_model.pkl", "flame2020"), ("FLAME2020.pkl", "flame2020"), ("flame2023.pkl", "flame2023")),
         *(("FLAME-2023.pkl", "flame2023"), ("flame2023_no_jaw.pkl", "flame2023_no_jaw")),
-        ("flame2023_Open.pkl", "flame2023_open"),
         *(("FLAME2020/male_model.pkl", "flame2020"), ("flame_2023/model.pkl", "flame2023")),
         *(
             ("FLAME2020/generic_model.pkl", "flame2020"),

@@ -178,13 +178,15 @@ REFUSED = {
     "bwdif": {"coding": {"x264-params": "tff=1:interlaced=1"}.items()},
     "zscale": {"color_trc": 18, "color_primaries": 9, "colorspace": 9},
     "overlay": {"codec": "qtrle", "pixels": "argb"},
+    "transparent ones": {"name": "a.webm", "codec": "libvpx-vp9", "pixels": "yuva420p"},
     "a multiple of 90 degrees": {"matrix": (0.7, 0.7, -0.7, 0.7)},
 }
 
 
 @pytest.mark.parametrize("found", REFUSED)
 def test_what_is_not_converted_is_refused_with_the_command(tmp_path, found):
-    path = write(tmp_path / "a.mov", range(0, 400, 40), **REFUSED[found])
+    options = {"name": "a.mov", **REFUSED[found]}
+    path = write(tmp_path / options.pop("name"), range(0, 400, 40), **options)
     with pytest.raises(InputError, match=found) as refused:
         probe_video(path)
     assert "ffmpeg -i IN" in str(refused.value)
