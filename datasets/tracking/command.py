@@ -12,6 +12,7 @@ from ...bench.io.files import write_json
 from ...bench.progress import counted
 from ...bench.protocol import evenly_with_ends
 from ...bench.specs import CommandResult
+from ...bench.tflite import LICENCE, WHEEL, fetch_networks
 from .settings import TrackSettings
 from .work import WORK, check_work_folder, make_work_folder
 
@@ -42,6 +43,10 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from .network import landmark_source
     from .track import LandmarkSource, check_cameras, track
 
+    if settings.fetch_networks:
+        files = fetch_networks()
+        text = f"Networks of {WHEEL} ({LICENCE}):"
+        return CommandResult("\n".join([text, *map(str, files)]), {"networks": [*map(str, files)]})
     if settings.program != "light":
         return track_with_program(settings, progress)
     out = Path(settings.out)
@@ -58,7 +63,9 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     capture_plan(clip, settings.capture)  # Captures that cannot be rewritten are detected before the fit.
     check_cameras(clip, cameras := [*settings.cameras] or [*clip.cameras])
     notes = {
-        "landmarks": Path(settings.landmarks).name or "vertices of the tracked mesh",
+        "landmarks": video.network
+        if video
+        else Path(settings.landmarks).name or "vertices of the tracked mesh",
         "seed": settings.seed,
     }
     source: LandmarkSource

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ...bench.contracts import HeadAsset, Progress
-from ...bench.errors import InputError
 from ...bench.io.arrays import Member, cached_arrays
-from ...bench.io.files import digest, digest_file
-from ...bench.landmark_network import COUNT, LandmarkNetwork
+from ...bench.io.files import digest
+from ...bench.landmark_network import COUNT
 from ...bench.progress import counted
+from ...bench.tflite import fetched_network
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
 from ..tracking.embedding import Embedding
@@ -22,11 +22,13 @@ from ..tracking.focal import FocalLength, estimate_focal
 from ..tracking.network import NetworkLandmarks, head_embedding
 from ..tracking.work import TRACKER_VERSION, make_work_folder
 from .clip import USUAL_FOCAL, VideoClip, open_video
+from .detector import FaceFinder
 
 if TYPE_CHECKING:
     from ..tracking.settings import TrackSettings
 
-NEEDED = ("head", "landmarks")
+EMBEDDED = "2023"
+"""Default head model of a video."""
 _FOCAL = {"pixels": Member("f", ()), "residuals": Member("f", ("N",)), "tried": Member("f", ("N",))}
 
 
@@ -35,6 +37,8 @@ class OpenedVideo(NamedTuple):
 
     clip: CaptureClip
     landmarks: NetworkLandmarks
+    network: str
+    """Name of the file of the landmark network."""
     data: dict[str, Any]
     lines: list[str]
 
@@ -42,31 +46,28 @@ class OpenedVideo(NamedTuple):
 def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) -> OpenedVideo:
     """The clip of a video with its focal length.
 
-    Its frames and results are stored in ``folder``, from which a later call resumes. Raises `InputError` for options
-    that are missing, and as `open_video`.
+    Its frames and results are stored in ``folder``, from which a later call resumes. Raises `InputError` as `open_video`.
     """
     path = Path(settings.capture)
-    for name in NEEDED:
-        if not getattr(settings, name):
-            raise InputError("command line", f"--{name}", "a value, for the file of a video", "none")
-    named = settings.head or ""
+    named = settings.head or EMBEDDED
     head = target_head(named, "--head")
-    network, weights = LandmarkNetwork(Path(settings.landmarks)), digest_file(Path(settings.landmarks))
+    network = Path(settings.landmarks or fetched_network("landmarks"))
+    finder = FaceFinder(network)
     own = replace(
         settings, head=named if Path(named).exists() else None
     )  # the name of a head is not passed to a reader
     teacher = own.open(settings.embedding, progress) if settings.embedding else None
     make_work_folder(folder)
-    mark = digest(TRACKER_VERSION, weights, head.fingerprint(), teacher.fingerprint if teacher else "")
+    mark = digest(TRACKER_VERSION, finder.digest, head.fingerprint(), teacher.fingerprint if teacher else "")
     embedding = Embedding(
         **cached_arrays(
             folder / "embedding.npz",
             mark,
             _embedding_arrays(head),
-            lambda: head_embedding(network, head, teacher, progress)._asdict(),
+            lambda: head_embedding(finder.network, head, teacher, progress)._asdict(),
         )
     )
-    video = open_video(path, settings, head, network, weights, folder, progress)
+    video = open_video(path, settings, head, finder, folder, progress)
     clip, focal = video.clip, None
     landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
     if settings.focal is None:
@@ -87,7 +88,11 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
             clip = video.with_focal(focal.pixels / video.view.scale)
             landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
     return OpenedVideo(
-        clip, landmarks, _data(video, settings.focal, focal), _lines(video, settings.focal, focal)
+        clip,
+        landmarks,
+        network.name,
+        _data(video, settings.focal, focal),
+        _lines(video, settings.focal, focal),
     )
 
 
