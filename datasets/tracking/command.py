@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,13 +81,17 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     overlay = draw_overlay(tracked.clip, timesteps, evenly_with_ends(cameras, COLUMNS))
     write_image(out / PICTURE, overlay)
     union = write_capture(tracked.clip, out, progress)
+    if video is not None:
+        video.data["video"]["frames_used"] = [
+            video.numbers[residual.timestep] for residual in tracked.report.residuals
+        ]
     data: dict[str, Any] = {
         "capture": union.as_posix(),
         **notes,
         **(video.data if video else {}),
         **tracked.report.to_json(),
     }
-    lines = [*(video.lines if video else []), *_text(tracked)]
+    lines = [*(video.lines if video else []), *_text(tracked, video.numbers if video else None)]
     if exact is not None:
         errors = tracking_errors(tracked.clip, exact)
         data["errors_mm"] = {name: error._asdict() for name, error in errors.items()}
@@ -97,12 +101,24 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     return CommandResult("\n".join([*lines, f"Capture: {union}"]), data)
 
 
-def _text(tracked: Tracked) -> list[str]:
-    summary = tracked.report.summary()
-    timesteps = counted(len(tracked.report.residuals), "timestep")
-    cameras = counted(len(tracked.report.cameras), "camera")
+def _text(tracked: Tracked, numbers: Sequence[int] | None) -> list[str]:
+    """Lines of a summary; timesteps are those of the input, of a video the ``numbers`` of its frames."""
+    from ..video.command import listed
+
+    report, summary = tracked.report, tracked.report.summary()
+    timesteps = counted(len(report.residuals), "timestep")
+    cameras = counted(len(report.cameras), "camera")
+    total = len(report.residuals) + len(report.left_out)
+    lines = [f"{timesteps} of {total} tracked, {cameras}, {summary['seconds_per_timestep']:.2f} s a timestep"]
+    for name, found, why in (
+        ("left out", report.without_landmarks, "where no landmarks fit the head model"),
+        ("left out", report.outliers, "whose fit differs from that of the neighbours"),
+        ("repeated", report.fitted_again, "whose first fit differed from that of the neighbours"),
+    ):
+        if found:
+            lines.append(f"  {name}   {listed([numbers[one] if numbers else one for one in found])}, {why}")
     return [
-        f"{timesteps}, {cameras}, {summary['seconds_per_timestep']:.2f} s a timestep",
+        *lines,
         f"  landmarks  {summary['landmarks_px']:.2f} pixels root mean square",
         f"  colours    {summary['colour_levels']:.2f} levels of 255, median",
     ]

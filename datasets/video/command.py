@@ -39,6 +39,8 @@ class OpenedVideo(NamedTuple):
     landmarks: NetworkLandmarks
     network: str
     """Name of the file of the landmark network."""
+    numbers: list[int]
+    """Numbers in the file of the frames of the clip."""
     data: dict[str, Any]
     lines: list[str]
 
@@ -91,6 +93,7 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
         clip,
         landmarks,
         network.name,
+        video.faces.numbers[video.faces.found].tolist(),
         _data(video, settings.focal, focal),
         _lines(video, settings.focal, focal),
     )
@@ -139,14 +142,14 @@ def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
     ]
     faces = video.faces
     if video.without_face:
-        lines.append(f"  left out   {_listed(video.without_face)}, where the person's face is missing")
+        lines.append(f"  left out   {listed(video.without_face)}, where the person's face is missing")
     if elsewhere := [one.number for one in faces.again if one.elsewhere]:
         lines.append(
-            f"  again      the face was found again at another place in {_listed(elsewhere)}; check that it is the same person"
+            f"  again      the face was found again at another place in {listed(elsewhere)}; check that it is the same person"
         )
     if faces.others.any():
         lines.append(
-            f"  others     {_listed(faces.numbers[faces.others > 0].tolist())} with a second face. The face that is largest in "
+            f"  others     {listed(faces.numbers[faces.others > 0].tolist())} with a second face. The face that is largest in "
             f"frame {faces.numbers[faces.found][0]} is followed."
         )
     if video.unsure:
@@ -157,6 +160,7 @@ def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
     return lines
 
 
-def _listed(numbers: Sequence[int]) -> str:
+def listed(numbers: Sequence[int]) -> str:
+    """How many frames, and which."""
     shown = ", ".join(map(str, numbers[:8])) + (" ..." if len(numbers) > 8 else "")
     return f"{counted(len(numbers), 'frame')} ({shown})"

@@ -145,6 +145,7 @@ def test_a_video_becomes_a_capture_of_its_frames(settings, filmed, monkeypatch):
     numbers = [number for number in range(COUNTED) if number != FACELESS]
     assert len(clip.files) == len(numbers)
     assert found.data["video"]["without_face"] == [FACELESS]
+    assert found.data["video"]["frames_used"] == numbers
     again = found.data["video"]["found_again"]
     assert [one["number"] for one in again] == numbers[1:]
     assert all(0 <= one["jump"] < 0.5 for one in again)
