@@ -156,7 +156,7 @@ class MaskSource:
     def mask(self, frame: TimedFrame, view: FrameView, face: FloatArray) -> ByteArray:
         """(H, W) 8-bit coverage of the person in the view of a frame with landmarks ``face``, (L, 2) pixels of the frame."""
         if self._network is not None:
-            return view.image(self._network.mask(frame.image))
+            return self._network.mask(view.image(frame.image))  # where the person is larger than in the frame
         if self._background is not None:
             found = self._background.mask(view.image(frame.image), view.points(face))
             self.unsure[frame.number] = found.unsure
