@@ -15,7 +15,8 @@ class VideoOptions:
     """Options of `headbench track` for a video file; without effect on captures."""
 
     segmentation: str = ""
-    """Video: MediaPipe's selfie_segmentation.tflite, which finds the person in each frame; needs ai-edge-litert."""
+    """Video: MediaPipe's selfie_segmentation.tflite, which finds the person in each frame; default without --masks: that of
+    --fetch-networks."""
 
     masks: str = ""
     """Video: folder of masks instead, of the video's size, named by the number of the frame in the file (00000.png or 0000.jpg is

@@ -109,7 +109,7 @@ def settings(filmed, monkeypatch, tmp_path):
 
     class Network:
         def __init__(self, path):
-            pass
+            self.network, self.digest = self, "digest"
 
         def find(self, image, near=None):
             return known[digest(image)]
@@ -122,7 +122,7 @@ def settings(filmed, monkeypatch, tmp_path):
 
     monkeypatch.setattr(fit, "LEVELS", fit.LEVELS[:1])  # landmarks alone are exact here
     monkeypatch.setattr(focal, "TRIED", focal.TRIED[1:6:2])
-    monkeypatch.setattr(command, "LandmarkNetwork", Network)
+    monkeypatch.setattr(command, "FaceFinder", Network)
     monkeypatch.setattr(video_clip, "crop_around", lambda faces, width, height: Crop(0, 0, width, height))
     given = {
         "head": "2023",
@@ -145,6 +145,7 @@ def test_a_video_becomes_a_capture_of_its_frames(settings, filmed, monkeypatch):
     numbers = [number for number in range(COUNTED) if number != FACELESS]
     assert len(clip.files) == len(numbers)
     assert found.data["video"]["without_face"] == [FACELESS]
+    assert found.data["video"]["frames_used"] == numbers
     again = found.data["video"]["found_again"]
     assert [one["number"] for one in again] == numbers[1:]
     assert all(0 <= one["jump"] < 0.5 for one in again)
@@ -163,10 +164,8 @@ def test_a_video_becomes_a_capture_of_its_frames(settings, filmed, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"masks": ""}, "expected one of --segmentation"),
+        ({"masks": ""}, "fetch-networks"),
         ({"segmentation": "a.tflite"}, "found both"),
-        ({"landmarks": ""}, "--landmarks"),
-        ({"head": None}, "--head"),
         ({"head": "2020"}, "head_model"),
         ({"masks": "nowhere"}, "nowhere"),
         ({"masks": "background"}, "--masks background, found 1"),
@@ -183,8 +182,8 @@ class Stopped(Exception):
 
 
 WORKING = {
-    "follow": lambda: command.LandmarkNetwork,
-    "find_all": lambda: command.LandmarkNetwork,
+    "follow": lambda: command.FaceFinder,
+    "find_all": lambda: command.FaceFinder,
     "write_image": lambda: video_clip,
     "estimate_focal": lambda: command,
     "fit_colours": lambda: track.Fitter,
