@@ -174,8 +174,7 @@ def track(
     )
     if len(kept) < LEAST_TRACKED * len(timesteps):
         expected = f"timesteps of which at least {LEAST_TRACKED:.0%} can be tracked"
-        found = f"{len(kept)} of {len(timesteps)}"
-        raise InputError(where, "", expected, found, "Film one face, sharp, from the front, in even light.")
+        raise InputError(where, "", expected, f"{len(kept)} of {len(timesteps)}")
     state = HeadState(
         np.asarray(fits.shape, np.float32), np.stack([fits.poses[timestep] for timestep in kept])
     )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ...bench.contracts import HeadAsset, Progress
+from ...bench.errors import InputError
 from ...bench.io.arrays import Member, cached_arrays
 from ...bench.io.files import digest
 from ...bench.landmark_network import COUNT
@@ -23,6 +24,7 @@ from ..tracking.network import NetworkLandmarks, head_embedding
 from ..tracking.work import TRACKER_VERSION, make_work_folder
 from .clip import USUAL_FOCAL, FrameView, VideoClip, open_video
 from .detector import FaceFinder
+from .faces import LEAST_SEEN, REMEDY
 
 if TYPE_CHECKING:
     from ..tracking.settings import TrackSettings
@@ -61,6 +63,7 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
     )  # the name of a head is not passed to a reader
     teacher = own.open(settings.embedding, progress) if settings.embedding else None
     make_work_folder(folder)
+    video = open_video(path, settings, head, finder, folder, progress)
     mark = digest(TRACKER_VERSION, finder.digest, head.fingerprint(), teacher.fingerprint if teacher else "")
     embedding = Embedding(
         **cached_arrays(
@@ -70,13 +73,15 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
             lambda: head_embedding(finder.network, head, teacher, progress)._asdict(),
         )
     )
-    video = open_video(path, settings, head, finder, folder, progress)
     clip, focal = video.clip, None
     landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
+    found = landmarks(sorted(clip.poses))
+    if (count := int(found.seen.sum())) < LEAST_SEEN * len(found.seen):
+        expected = f"a face whose landmarks fit the head model in at least {LEAST_SEEN:.0%} of the frames"
+        raise InputError(path, "", expected, f"it in {count} of {len(found.seen)}", REMEDY)
     if settings.focal is None:
         (camera,) = clip.cameras.values()
         side = max(video.info.width, video.info.height) * video.view.scale
-        found = landmarks(sorted(clip.poses))
         stored = cached_arrays(
             folder / "focal.npz",
             digest(mark, camera.K, side, found.pixels),

@@ -20,6 +20,7 @@ from .detector import FaceFinder
 
 LEAST_SEEN = 0.5
 """Minimum fraction of frames with a detected face."""
+REMEDY = "Film one face, upright, lit from the front, at least a tenth of the picture's height."
 ABOVE, BELOW, BESIDE = 1.0, 0.6, 0.8
 """Room around the landmarks in a crop, relative to their height or width: hair, neck, and turns of the head."""
 SEARCHED = 10
@@ -216,8 +217,7 @@ def find_faces(
     if seen < max(1, LEAST_SEEN * count):
         expected = f"the face of one person in at least {LEAST_SEEN:.0%} of the frames"
         said = f"it in {seen} of {count}" if seen else f"no face in any of {count}"
-        remedy = "Film one face, upright, lit from the front, at least a tenth of the picture's height."
-        raise InputError(path, "", expected, said, remedy)
+        raise InputError(path, "", expected, said, REMEDY)
     pixels = np.where(found[:, None, None], kept["pixels"], np.nan)
     return FoundFaces(kept["numbers"], pixels, kept["others"])
 

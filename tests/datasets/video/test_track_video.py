@@ -20,7 +20,7 @@ from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.images import write_image
 from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
 from headbench.datasets.tracking import command as tracking_command
-from headbench.datasets.tracking import fit, focal, track
+from headbench.datasets.tracking import fit, focal, network, track
 from headbench.datasets.tracking.command import track_capture
 from headbench.datasets.tracking.focal import FocalLength, estimate_focal
 from headbench.datasets.tracking.landmarks import ImageLandmarks, spread_vertices
@@ -175,6 +175,12 @@ def test_a_video_becomes_a_capture_of_its_frames(settings, filmed, monkeypatch):
 def test_what_is_missing_is_said(settings, changes, named):
     with pytest.raises(InputError, match=named):
         track_capture(settings(**changes))
+
+
+def test_a_face_unlike_the_head_model_is_refused(settings, monkeypatch):
+    monkeypatch.setattr(network, "MOST_MISFIT", 0.0)  # as for a drawn face
+    with pytest.raises(InputError, match="fit the head model in at least 50%.*it in 0 of 11"):
+        track_capture(settings(focal=None))
 
 
 class Stopped(Exception):
