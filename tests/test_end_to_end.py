@@ -36,7 +36,7 @@ TINY = ("--preset", "smoke", "--set=frames_per_task=3", *SMALL)
 """Few frames; two iterations of the methods of which nothing but that they run is asked."""
 pytestmark = pytest.mark.commands
 
-METHODS = {"mean-image", "nearest-camera", "textured-mesh", "ga", "gbs", "gha", "insta", "ours", "ours-plus"}
+METHODS = {"mean-image", "nearest-camera", "ga", "gbs", "gha", "insta", "ours", "ours-plus"}
 
 
 @contextmanager
@@ -86,7 +86,7 @@ def quality(folder: RunFolder):
 def test_every_cell_of_the_comparison_is_there(run):
     every = pd.read_parquet(run.rows)
     coded = every[(every["condition"] == "coded") & every["metric"].isin(["psnr", "storage"])]
-    assert set(coded["method"]) == METHODS - {"mean-image", "nearest-camera", "textured-mesh"}
+    assert set(coded["method"]) == METHODS - {"mean-image", "nearest-camera"}
     assert (coded["status"] == "ok").all()
     rows = every[every["condition"] == ""]
     assert set(rows["method"]) == METHODS

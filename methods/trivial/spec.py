@@ -46,7 +46,6 @@ NEAREST_CAMERA = MethodSpec(
 TEXTURED_MESH = MethodSpec(
     name="textured-mesh",
     default=True,
-    demo=True,
     summary="The posed mesh with the median colours of the training images: what tracking alone is worth.",
     implementation="headbench.methods.trivial.textured_mesh:TexturedMesh",
     trivial=True,
