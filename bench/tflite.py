@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
+import importlib.metadata
 import shutil
 import subprocess
 import sys
@@ -80,7 +80,8 @@ def fetch_networks() -> list[Path]:
 
 
 def _pip() -> list[str]:
-    if importlib.util.find_spec("pip"):
+    # Not looked for as a module: setuptools would then replace distutils no more, which torch's extensions need.
+    if any(importlib.metadata.distributions(name="pip")):
         return [sys.executable, "-m", "pip"]
     if uv := shutil.which("uv"):
         return [uv, "tool", "run", "pip"]

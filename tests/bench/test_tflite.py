@@ -49,7 +49,7 @@ def test_without_a_network_or_pip_it_says_what_to_do(pip, monkeypatch):
     pip.clear()
     with pytest.raises(UnavailableError, match=f"no network.*pip download.*{tflite.WHEEL}"):
         tflite.fetch_networks()
-    monkeypatch.setattr(tflite.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(tflite.importlib.metadata, "distributions", lambda **named: ())
     monkeypatch.setattr(tflite.shutil, "which", lambda name: None)
     with pytest.raises(UnavailableError, match="ensurepip"):
         tflite.fetch_networks()
