@@ -8,7 +8,6 @@ Formats read:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,18 +26,19 @@ MOST_CHANGE = 0.05
 """Maximum movement of landmarks, relative to the face's size, when the crop is repeated around them."""
 SAME = 0.5
 """Detections whose centres are closer than this, relative to their size, are the same face."""
-SETTLED = 0.01
-"""As `MOST_CHANGE`, for several faces: crops beside a face converge to it slowly."""
-_TRIED, _ROUNDS, _MORE_ROUNDS = 6, 3, 15
-_ACROSS, _FULLY_ACROSS = (0.35, 0.5, 0.65), (0.1, 0.225, 0.35, 0.5, 0.65, 0.775, 0.9)
+_TRIED, _ROUNDS = 6, 3
+_ACROSS = (0.35, 0.5, 0.65)
 
 
-class _Crop(NamedTuple):
-    """A square of an image."""
+class FaceCrop(NamedTuple):
+    """A square of an image around a face."""
 
-    middle: FloatArray  # (2,)
+    middle: FloatArray
+    """(2,) pixels."""
     side: float
-    angle: float  # radians
+    """Pixels."""
+    angle: float
+    """Of the line of the eyes to the rows of the image, radians."""
 
 
 class LandmarkNetwork:
@@ -53,9 +53,8 @@ class LandmarkNetwork:
     """
 
     def __init__(self, path: Path):
-        remedy = "It is in the wheel of mediapipe 0.10.21, as mediapipe/modules/face_landmark/face_landmark.tflite."
         expected = f"a network that finds {COUNT} landmarks"
-        self._network: Any = open_network(path, expected, remedy)
+        self._network: Any = open_network(path, expected)
         try:
             (self._input,) = self._network.get_input_details()
             outputs = self._network.get_output_details()
@@ -78,51 +77,35 @@ class LandmarkNetwork:
         if near is not None:
             found = self.follow(image, near)
             return self.find(image) if found is None else found
-        scored = self._scored(image, _ACROSS)[:_TRIED]
-        steady = [self._steady(image, found) for found, score in scored if score > 0]
-        best, change, _ = min(steady, key=lambda one: one[1], default=(None, np.inf, 0.0))
+        scored = sorted((self._run(image, crop) for crop in _candidates(image)), key=lambda one: -one[1])
+        steady = [self._steady(image, found) for found, score in scored[:_TRIED] if score > 0]
+        best, change = min(steady, key=lambda one: one[1], default=(None, np.inf))
         return best if change < MOST_CHANGE else None
+
+    def find_in(self, image: ByteArray, crop: FaceCrop) -> FloatArray | None:
+        """(COUNT, 2) landmarks of the face in a crop of a detector; None if the network finds none there."""
+        found, score = self._run(image, crop)
+        found, change = self._steady(image, found) if score > 0 else (found, np.inf)
+        return found if change < MOST_CHANGE else None
 
     def follow(self, image: ByteArray, near: FloatArray) -> FloatArray | None:
         """(COUNT, 2) landmarks of the face at ``near``, its landmarks in a similar image; None if it is not found."""
         found, score = self._run(image, _crop_around(near))
         return found if score > 0 else None
 
-    def find_all(self, image: ByteArray) -> list[FloatArray]:
-        """(COUNT, 2) landmarks of every face, the largest first; faces much smaller than the image are not found."""
-        seen: list[tuple[float, FloatArray]] = []
-        for found, score in self._scored(image, _FULLY_ACROSS):
-            if score > 0 and not any(same_face(found, face) for _, face in seen):
-                steady, change, score = self._steady(image, found, _MORE_ROUNDS, SETTLED)
-                if change < SETTLED:
-                    seen.append((score, steady))
-        faces: list[FloatArray] = []
-        # Detections beside a face have lower scores.
-        for _, face in sorted(seen, key=lambda one: -one[0]):
-            if all(face_distance(face, other) > 1 for other in faces):
-                faces.append(face)
-        return sorted(faces, key=face_size, reverse=True)
+    def _steady(self, image: ByteArray, found: FloatArray) -> tuple[FloatArray, float]:
+        """Landmarks after repeating the crop around them, and their last change relative to the face's size.
 
-    def _scored(self, image: ByteArray, across: Sequence[float]) -> list[tuple[FloatArray, float]]:
-        """Landmarks and scores of squares all over an image, the highest score first."""
-        crops = _candidates(image, across)
-        return sorted((self._run(image, crop) for crop in crops), key=lambda one: -one[1])
-
-    def _steady(
-        self, image: ByteArray, found: FloatArray, rounds: int = _ROUNDS, settled: float = 0.0
-    ) -> tuple[FloatArray, float, float]:
-        """Landmarks after repeating the crop around them, their last change relative to the face's size, and their score.
-
-        It stops after ``rounds``, or at a change below ``settled``. If the network sees a whole face, the landmarks converge.
+        If the network sees a whole face, the landmarks converge.
         """
         change, score = np.inf, 1.0
-        for _ in range(rounds):
-            if score > 0 and change >= settled:
+        for _ in range(_ROUNDS):
+            if score > 0:
                 before, (found, score) = found, self._run(image, _crop_around(found))
                 change = float(np.abs(found - before).mean() / face_size(found))
-        return found, change if score > 0 else np.inf, score
+        return found, change if score > 0 else np.inf
 
-    def _run(self, image: ByteArray, crop: _Crop) -> tuple[FloatArray, float]:
+    def _run(self, image: ByteArray, crop: FaceCrop) -> tuple[FloatArray, float]:
         """Landmarks, and the logit of the probability that the crop shows a face."""
         turn = crop.side / self._side * _turn(crop.angle)
         to_image = np.concatenate([turn, (crop.middle - turn @ np.full(2, self._side / 2))[:, None]], axis=1)
@@ -157,23 +140,23 @@ def same_face(first: FloatArray, second: FloatArray) -> bool:
     return face_distance(first, second) < SAME
 
 
-def _candidates(image: ByteArray, across: Sequence[float]) -> list[_Crop]:
+def _candidates(image: ByteArray) -> list[FaceCrop]:
     height, width = image.shape[:2]
     shorter = min(height, width)
     return [
-        _Crop(np.array([x * width, y * height]), side * shorter, 0.0)
+        FaceCrop(np.array([x * width, y * height]), side * shorter, 0.0)
         for side in (0.6, 0.9)
-        for x in across
+        for x in _ACROSS
         for y in (0.35, 0.5, 0.65)
     ]
 
 
-def _crop_around(landmarks: FloatArray) -> _Crop:
+def _crop_around(landmarks: FloatArray) -> FaceCrop:
     along = landmarks[CORNERS[1]] - landmarks[CORNERS[0]]
     angle = float(np.arctan2(along[1], along[0]))
     level = landmarks @ _turn(angle)
     low, high = level.min(axis=0), level.max(axis=0)
-    return _Crop(_turn(angle) @ ((low + high) / 2), CROP * float((high - low).max()), angle)
+    return FaceCrop(_turn(angle) @ ((low + high) / 2), CROP * float((high - low).max()), angle)
 
 
 def _turn(angle: float) -> FloatArray:

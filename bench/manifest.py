@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -45,6 +46,16 @@ class MethodRecord:
     def label(self) -> str:
         """Name in tables and folders."""
         return label_of(self.name, self.condition)
+
+
+CUTS = {"mask_below_neck": "bust-line", "mask_clothes": "parsing"}
+"""Steps that replace a part of the person by background."""
+
+
+def cut_of(steps: Iterable[Mapping[str, Any]]) -> str:
+    """What was last cut from the images of a clip, by the records of its steps: a value of `CUTS`, or "" for nothing."""
+    cuts = [CUTS.get(step["name"]) or step["parameters"].get("cut", "") for step in steps]
+    return next(filter(None, reversed(cuts)), "")
 
 
 @dataclass(frozen=True)

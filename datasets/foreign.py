@@ -188,10 +188,7 @@ def _unprepared(path: Path, names: list[str]) -> Foreign | None:
 
 
 def _track(video: str) -> str:
-    options = (
-        "--head FLAME2023.pkl --landmarks face_landmark.tflite --segmentation selfie_segmentation.tflite"
-    )
-    return f"headbench track {video} {options} --out capture makes a capture of one person."
+    return f"headbench track {video} --out capture makes a capture of one person."
 
 
 def _quoted(path: Path) -> str:

@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from .clip import CaptureClip
 
 
+Cut = Literal["bust-line", "none"]
+"""Part of a tracked person that commands replace by background."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class CaptureOptions:
     """Options of opening a capture."""

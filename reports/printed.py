@@ -34,6 +34,7 @@ def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
         tasks,
         protocol_ids=runs.protocol_ids,
         image_size=runs.image_size,
+        cut=runs.cut,
         machine=runs.machine,
         part=runs.part,
         keys=runs.keys,

@@ -17,7 +17,7 @@ from ..bench.engine.config import RunOptions
 from ..bench.engine.scoring import FULL
 from ..bench.engine.store import RunFolder
 from ..bench.errors import InputError
-from ..bench.manifest import ClipRecord, Manifest, MethodRecord
+from ..bench.manifest import ClipRecord, Manifest, MethodRecord, cut_of
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, joined_protocol, missing_tasks
 from ..bench.rows import ALL, Rows
 from ..bench.source import is_outside
@@ -352,6 +352,17 @@ class RunSet:
         return (
             f"Files of these methods changed between the runs, although their version did not: {', '.join(changed)}.",
         ) * bool(changed)
+
+    @property
+    def cut(self) -> str:
+        """What was replaced by background in the images of the captures, for captions."""
+        cuts = {cut_of(clip.steps) for run in self.runs for clip in run.manifest.clips}
+        words = {
+            "bust-line": "cut below the bust line",
+            "parsing": "clothes cut by a face parsing",
+            "": "not cut",
+        }
+        return "; ".join(words[cut] for cut in sorted(cuts)) if cuts != {""} else ""
 
     @property
     def image_size(self) -> str:

@@ -233,6 +233,7 @@ def table_of(
         changed=runs.changed,
         protocol_ids=runs.protocol_ids,
         image_size=runs.image_size,
+        cut=runs.cut,
         machine=runs.machine,
         part=runs.part if tasks else "",
         missing=(*(runs.missing if tasks == runs.tasks else ()), *runs.mixed_code, *runs.unchecked),

@@ -97,7 +97,7 @@ AVERAGED = "frames, then sequences, then subjects"
 class Table:
     """A comparison that can be written in any format.
 
-    ``marking`` explains the ranks and their test (``tested``: whether there is one), ``starred`` those of text, which marks
+    ``warnings`` name methods that are not better than a trivial baseline; ``marking`` explains the ranks and their test (``tested``: whether there is one), ``starred`` those of text, which marks
     only the best; ``part`` describes the part of the
     frames, "" for all; ``missing`` explains why a task has no columns; ``name`` is the layout; ``cameras`` describes seen and
     unseen cameras, or why they are not shown separately; ``printed`` is the source of published values, with their conditions
@@ -109,9 +109,11 @@ class Table:
     notes: tuple[str, ...]
     tasks: tuple[TaskSummary, ...]
     seeds: int
+    warnings: tuple[str, ...] = ()
     marking: str = ""
     starred: str = ""
     image_size: str = ""
+    cut: str = ""
     machine: str = ""
     part: str = ""
     missing: tuple[str, ...] = ()
@@ -145,7 +147,7 @@ class Table:
     @property
     def facts(self) -> tuple[str, ...]:
         """The sentences of the caption."""
-        return self.sentences(self.marking)
+        return (*self.warnings, *self.sentences(self.marking))
 
     def sentences(self, marking: str, *, details: bool = True) -> tuple[str, ...]:
         """What to know to read the table; with ``details`` also the protocols and how values were averaged."""
@@ -155,7 +157,7 @@ class Table:
             parts.append(f"{task.title}: {task.size}, protocol {name}({task.protocol_hash}).")
         parts += [*self.missing, *filter(None, [self.cameras, self.part])]
         if self.image_size:
-            parts.append(f"Images of {self.image_size} pixels.")
+            parts.append(f"Images of {self.image_size} pixels{self.cut and f', {self.cut}'}.")
         spread = f"mean of {self.seeds} seeds ± standard deviation over seeds"
         seeds = spread if self.seeds > 1 else "one seed"
         if details:
@@ -207,6 +209,13 @@ TITLES = {"speed": "Speed", "cost": "Storage and training"}
 METHODS_TITLE = "Methods"
 TRIVIAL_TITLE = "Trivial baselines (not ranked)"
 SUSPECT_TITLE = "Suspect: better than any method that has not seen the frames (not ranked)"
+BELOW_TITLE = "Not better than a trivial baseline (not ranked)"
+BELOW_CAUSES = (
+    "Usual causes: tracking or masks that are off, a part of the person that no mesh explains, too short a training; see "
+    "`headbench lint` and the pictures of textured-mesh, which shows what tracking alone is worth."
+)
+DECIDING = "psnr"
+"""Metric by which a method is compared with trivial baselines; without it, the first one of frames."""
 CONDITIONS_TITLE = "Under other conditions (not ranked)"
 
 
@@ -220,6 +229,7 @@ def build_table(
     changed: Sequence[str] = (),
     protocol_ids: Mapping[str, str],
     image_size: str = "",
+    cut: str = "",
     machine: str = "",
     part: str = "",
     missing: Sequence[str] = (),
@@ -248,7 +258,7 @@ def build_table(
     keys : Mapping[str, Collection[FrameKey]] | None
         Frames of each task, if some scored frames have no rows.
     protocol_ids : Mapping[str, str]
-        Readable name of each task's protocol, for the caption, like ``image_size``, ``machine`` (if
+        Readable name of each task's protocol, for the caption, like ``image_size``, ``cut``, ``machine`` (if
         the rows do not record the machine that measured speed), ``part``, ``cameras``, ``averaged`` and
         the sentences of ``missing``.
     avatar_title : str
@@ -276,7 +286,11 @@ def build_table(
     suspect = suspects(rows, methods)
     too_good = {method for _, method, _ in suspect}
     titles = dict.fromkeys(methods, METHODS_TITLE)
-    for title, own in ((SUSPECT_TITLE, too_good), (TRIVIAL_TITLE, trivial), (CONDITIONS_TITLE, changed)):
+    below = not_better(rows, metrics, methods, trivial, tasks)
+    for title, own in (
+        *((BELOW_TITLE, below), (SUSPECT_TITLE, too_good)),
+        *((TRIVIAL_TITLE, trivial), (CONDITIONS_TITLE, changed)),
+    ):
         titles |= {method: title for method in methods if method in own}
     unranked = {method for method, title in titles.items() if title != METHODS_TITLE}
     notes: list[str] = []
@@ -298,7 +312,7 @@ def build_table(
     marking, starred = _marking(columns, lines, bests)
     groups = [
         (title, tuple(line for line in lines if titles[line.method] == title))
-        for title in (METHODS_TITLE, SUSPECT_TITLE, CONDITIONS_TITLE, TRIVIAL_TITLE)
+        for title in (METHODS_TITLE, BELOW_TITLE, SUSPECT_TITLE, CONDITIONS_TITLE, TRIVIAL_TITLE)
     ]
     return Table(
         columns=columns,
@@ -309,9 +323,11 @@ def build_table(
             for task in tasks
         ),
         seeds=max(1, len(rows.seeds(ALL))),
+        warnings=(*below.values(), BELOW_CAUSES) if below else (),
         marking=marking,
         starred=starred,
         image_size=image_size,
+        cut=cut,
         machine=measured_on(found.get("fps", {}), trivial, machine),
         part=part,
         missing=tuple(missing),
@@ -320,6 +336,40 @@ def build_table(
         name=name,
         tested=any(best is not None and best.methods is not None for best in bests),
     )
+
+
+def not_better(
+    rows: Rows,
+    metrics: Sequence[MetricSpec],
+    methods: Sequence[str],
+    trivial: Sequence[str],
+    tasks: Sequence[str],
+) -> dict[str, str]:
+    """Sentences by method on those that are not better than a trivial baseline in some task."""
+    found: dict[str, str] = {}
+    of_frames = sorted((spec for spec in metrics if spec.per_frame), key=lambda spec: spec.name != DECIDING)
+    for spec in of_frames[:1]:
+        sign = 1 if spec.higher_is_better else -1
+        for task in tasks:
+            values = {name: summarise(rows, name, spec.name, task).value for name in (*methods, *trivial)}
+            floors = {name: sign * value for name in trivial if (value := values[name]) is not None}
+            best = max(floors, key=floors.__getitem__, default="")
+            for name in methods:
+                value = values[name]
+                if (
+                    name in trivial
+                    or name in found
+                    or not best
+                    or value is None
+                    or sign * value > floors[best]
+                ):
+                    continue
+                amounts = (
+                    f"{value:.{spec.digits}f} against {values[best]:.{spec.digits}f} {spec.unit}".rstrip()
+                )
+                where = TASK_TITLES.get(task, task).lower()
+                found[name] = f"{name} is not better than {best} in {where}: {spec.label} {amounts}."
+    return found
 
 
 def _task_summary(rows: Rows, task: str, protocol_id: str, keys: Collection[FrameKey]) -> TaskSummary:

@@ -68,7 +68,8 @@ def to_text(table: Table, *, details: bool = False, fit: bool = False) -> str:
     Only the best values are marked. With ``details``, the text below states protocols and how values were averaged.
     """
     sizes = {task.title: f" ({task.size})" for task in table.tasks}
-    blocks = []
+    warnings = "\n".join(map(terminal.wrapped, table.warnings) if fit else table.warnings)
+    blocks = [warnings] if warnings else []
     for title in dict.fromkeys(column.title for column in table.columns):
         chosen = [i for i, column in enumerate(table.columns) if column.title == title]
         heads = [_head(table.columns[i]) for i in chosen]

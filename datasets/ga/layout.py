@@ -151,6 +151,8 @@ class Declaration:
         Reason by timestep index of the folder's JSONs, for frames excluded from all splits.
     synthetic : Mapping[str, Any]
         How the capture was synthesised; empty for a recording.
+    cut : str
+        What was replaced by background below the head: "bust-line", "parsing", or "" if nothing is known of it.
     """
 
     subject: str
@@ -161,6 +163,7 @@ class Declaration:
     sequences: Mapping[str, str] = field(default_factory=dict)
     excluded: Mapping[int, str] = field(default_factory=dict)
     synthetic: Mapping[str, Any] = field(default_factory=dict)
+    cut: str = ""
 
     def write(self, folder: Path) -> None:
         """Write ``headbench.json`` into ``folder``."""
@@ -179,7 +182,8 @@ class Declaration:
 
     def _content(self) -> dict[str, Any]:
         excluded = [{"timestep": t, "reason": reason} for t, reason in sorted(self.excluded.items())]
-        return {"format_version": FORMAT_VERSION, **vars(self), "excluded": excluded}
+        content = {"format_version": FORMAT_VERSION, **vars(self), "excluded": excluded}
+        return content if self.cut else {name: content[name] for name in content if name != "cut"}
 
     @classmethod
     def read(cls, folder: Path) -> Declaration | None:
@@ -231,3 +235,4 @@ class _DeclarationFile:
     sequences: dict[str, str] = field(default_factory=dict)
     excluded: tuple[_Exclusion, ...] = ()
     synthetic: dict[str, Any] = field(default_factory=dict)
+    cut: Literal["", "bust-line", "parsing"] = ""

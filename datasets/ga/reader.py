@@ -148,6 +148,7 @@ def read_capture(
         "held_out_cameras": list(held_out_cameras),
         "leaks": check_leaks(folder, found, leaks),
         "synthetic": dict(declaration.synthetic) if declaration else {},
+        **({"cut": declaration.cut} if declaration and declaration.cut else {}),
         **tracking.notes,
     }
     fingerprint = tracking.head.fingerprint()

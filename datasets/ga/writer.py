@@ -206,6 +206,7 @@ class CapturePlan:
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     cy: layout.CyConvention = "bottom"
     synthetic: Mapping[str, Any] = field(default_factory=dict)
+    cut: str = ""
 
     def __post_init__(self) -> None:
         names = [sequence.name for sequence in self.sequences]
@@ -351,6 +352,7 @@ class CaptureWriter:
                 for timestep, reason in sequence.excluded.items()
             },
             synthetic=self.plan.synthetic,
+            cut=self.plan.cut,
         )
 
 

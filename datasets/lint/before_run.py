@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from pathlib import Path
 
@@ -12,14 +13,18 @@ from .evidence import gather_clip
 from .rules import Finding, apply
 from .settings import LintSettings
 
+log = logging.getLogger(__name__)
+
 VIEWS = 24
 """Most decoded frames, spread over timesteps and cameras."""
+TORSO = "HB704"
+"""Code of the warning of a part of the person that no head model explains, which is shown before a run, too."""
 SPLITS = "HB2"
 """Codes of errors of the splits."""
 
 
 def errors(clip: Clip) -> list[str]:
-    """Code, fault, file and remedy of each error of the linter, from a part of the clip's frames.
+    """Code, fault, file and remedy of each error of the linter, from a part of the clip's frames; `TORSO` is logged.
 
     Errors of the splits are left out if the reader was asked to record them. Captures without a head model in FLAME's layout
     are not checked.
@@ -30,13 +35,19 @@ def errors(clip: Clip) -> list[str]:
     rules = [
         rule
         for rule in RULES
-        if rule.severity == "error" and not rule.refused and not (recorded and rule.code.startswith(SPLITS))
+        if rule.code == TORSO
+        or (rule.severity == "error" and not rule.refused and not (recorded and rule.code.startswith(SPLITS)))
     ]
     folder = Path(clip.subject)
     evidence = gather_clip(folder, as_capture(clip), LintSettings(views=VIEWS), no_progress, before_run=True)
-    return [
-        f"{found.code}: {found.message}{_where(found)}. {found.remedy}" for found in apply(rules, evidence)
-    ]
+    errors = []
+    for found in apply(rules, evidence):
+        text = f"{found.code}: {found.message}{_where(found)}. {found.remedy}"
+        if found.severity == "error":
+            errors.append(text)
+        else:
+            log.warning("%s: %s", clip.subject, text)
+    return errors
 
 
 def _where(found: Finding) -> str:

@@ -337,6 +337,8 @@ OUTSIDE = 0.15
 
 SMALL = 0.2
 """Ratio of the areas of mesh and foreground below which the mesh is too small or the mask too large."""
+MOST_FAR = 0.1
+"""Fraction of the foreground far from the mesh above which the mask holds more than a head model explains."""
 
 
 def _laid(evidence: Evidence) -> list[tuple[ViewFacts, MeshFacts, float]]:
@@ -410,6 +412,23 @@ def _small(evidence: Evidence) -> Iterator[Hit]:
         yield Hit(
             f"the mesh covers {np.median(sizes):.0%} of the foreground's area (median over "
             f"{counted(len(sizes), 'frame')})",
+            evidence.folder,
+        )
+
+
+@rule("HB704", "warning")
+def _far_away(evidence: Evidence) -> Iterator[Hit]:
+    """A large part of the foreground is far from the mesh, such as shoulders and clothes, which no head model explains.
+
+    Cut it: `headbench track` and `headbench import tracking` do so by default (--cut, --parsing); for other captures read
+    with `reader_settings.below_neck=false`, or mask the clothes.
+    """
+    if mesh_misses(evidence):
+        return
+    shares = [mesh.far for _, mesh, _ in _laid(evidence) if mesh.far is not None]
+    if shares and np.median(shares) > MOST_FAR:
+        yield Hit(
+            f"{np.median(shares):.0%} of the foreground is far from the mesh (median over {counted(len(shares), 'frame')})",
             evidence.folder,
         )
 

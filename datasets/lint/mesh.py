@@ -149,6 +149,8 @@ WORKING_HEIGHT = 400
 """Maximum height of filled meshes in pixels, since only coarse values are needed."""
 
 MIN_SKIN_PIXELS = 12
+FAR = 0.2
+"""Distance from the mesh relative to its height in the image: about 6 cm, more than most hair."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,6 +177,8 @@ class MeshFacts:
         Intersection over union of mesh and foreground; None without a mask.
     size : float | None
         Area of the mesh divided by that of the foreground; None without a mask.
+    far : float | None
+        Fraction of the foreground that is farther from the mesh than `FAR`; None without a mask.
     skin : FloatArray | None
         Median colour (3,) of the face's visible skin, 8-bit levels; None if little of it is visible.
     """
@@ -188,6 +192,7 @@ class MeshFacts:
     face_outside: float | None = None
     overlap: float | None = None
     size: float | None = None
+    far: float | None = None
     skin: FloatArray | None = None
 
 
@@ -244,6 +249,7 @@ def _held_against(
         skin=skin,
         overlap=float((filled & foreground).sum() / (filled | foreground).sum()),
         size=float(filled.sum() / foreground.sum()),
+        far=_far(filled, foreground),
         face_outside=_face_outside(subject, vertices, small, filled, foreground),
     )
 
@@ -259,6 +265,14 @@ def _skin(
     if foreground is not None:
         shows &= foreground
     return np.median(image[shows], axis=0) if shows.sum() >= MIN_SKIN_PIXELS else None
+
+
+def _far(filled: np.ndarray, foreground: np.ndarray) -> float:
+    rows = np.flatnonzero(filled.any(axis=1))
+    if not len(rows):
+        return 1.0
+    distance = cv2.distanceTransform((~filled).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return float((distance[foreground] > FAR * (rows[-1] - rows[0] + 1)).mean())
 
 
 def _face_outside(

@@ -6,15 +6,19 @@ B, in display-referred colours, as in other tools.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from scipy.special import ndtr
 
-from ...bench.contracts import Camera, FloatArray, FrameKey, HeadAsset, IntArray
+from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadAsset, IntArray
 from ...bench.errors import InputError
+from ...bench.io.files import digest, digest_file
+from ...bench.io.images import read_pixels
 from ..clip import CaptureClip, FramePixels
 from ..head.subject import PosedSubject
 
@@ -113,6 +117,64 @@ def mask_below_neck(clip: CaptureClip) -> CaptureClip:
         return FramePixels(composite(pixels.image, weights, ground), coverage)
 
     return clip.derive_pixels("mask_below_neck", {"softness": SOFTNESS, "anchors": anchors.tolist()}, cut)
+
+
+def mask_clothes(
+    clip: CaptureClip, labels: Mapping[FrameKey, Path], view: Callable[[ByteArray], ByteArray] | None = None
+) -> CaptureClip:
+    """Replace clothes, and what is no part of the person, by background, in images and masks.
+
+    Parameters
+    ----------
+    labels : Mapping[FrameKey, Path]
+        Image of each frame with the labels of CelebAMask-HQ's 19 classes.
+    view : Callable[[ByteArray], ByteArray] | None
+        The part of an image of coverage that a frame of the clip shows; None for all of it.
+    """
+    ground = np.asarray(clip.background, dtype=np.float32)
+    files = {clip.recorded(key): labels[key] for key in clip.files}
+
+    def cut(key: FrameKey, pixels: FramePixels) -> FramePixels:
+        height, width = pixels.image.shape[:2]
+        kept = 255 * np.isin(read_labels(files[key]), (NO_PERSON, CLOTH), invert=True).astype(np.uint8)
+        kept = kept if view is None else view(kept)
+        weights = cv2.resize(kept, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        coverage = weights if pixels.coverage is None else np.minimum(pixels.coverage, weights)
+        return FramePixels(composite(pixels.image, weights, ground), coverage)
+
+    content = digest(*(digest_file(path) for _, path in sorted(files.items())))
+    return clip.derive_pixels("mask_clothes", {"labels": content}, cut)
+
+
+NO_PERSON, CLOTH, CLASSES = 0, 16, 19
+"""Labels of CelebAMask-HQ in the order of face-parsing.PyTorch, and their number."""
+
+
+def read_labels(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
+    """(H, W) labels of an image of `CLASSES` labels. Raises `InputError` for another image, or another (width, height)."""
+    pixels = read_pixels(path, size)
+    if pixels.ndim != 2 or pixels.max() >= CLASSES:
+        expected = f"a grey 8-bit image of labels from 0 to {CLASSES - 1}, as face-parsing.PyTorch gives them"
+        found = f"levels up to {pixels.max()}" if pixels.ndim == 2 else "colours"
+        raise InputError(path, "", expected, found, "Pictures of the labels in colours cannot be read.")
+    return pixels
+
+
+def without_torso(
+    clip: CaptureClip, cut: str, parsing: str, view: Callable[[ByteArray], ByteArray] | None = None
+) -> CaptureClip:
+    """The clip without clothes by the labels in the folder ``parsing``, else with the cut of the options of commands.
+
+    Frames without masks are not cut, since the room behind the person remains in them, too.
+    """
+    if not parsing:
+        masked = all(clip.has_mask(key) for key in clip.files)
+        return mask_below_neck(clip) if cut == "bust-line" and masked else clip
+    images = {key: files.image for key, files in clip.files.items()}
+    labels = {key: Path(parsing) / f"{path.stem}.png" for key, path in images.items() if path is not None}
+    for path in labels.values():
+        read_labels(path)
+    return mask_clothes(clip, labels, view)
 
 
 def neck_anchors(head: HeadAsset) -> IntArray:

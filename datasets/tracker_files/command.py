@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import write_json
+from ...bench.manifest import cut_of
 from ...bench.progress import counted
 from ...bench.protocol import evenly_with_ends
 from ...bench.specs import CommandResult
@@ -36,6 +38,7 @@ def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_pr
     from ..images import write_image
     from ..monocular.clip import clip_of_track, subject_of
     from ..overlay import draw_overlay
+    from ..steps.masks import without_torso
     from .formats import recognise
     from .frames import FOLDER, frame_files, read_frames
     from .pictures import find_pictures
@@ -63,6 +66,7 @@ def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_pr
         use_cache=False,
         progress=progress,
     )
+    clip = without_torso(clip, settings.cut, settings.parsing)
     capture_plan(clip, root)  # Captures that cannot be written are detected before anything is.
     check_apart(clip, out)
     timesteps = evenly_with_ends(sorted(clip.poses), SHOWN)
@@ -77,6 +81,7 @@ def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_pr
         "images": pictures.folder.as_posix(),
         "first_image": pictures.first,
         "masks": pictures.masks,
+        "cut": cut_of(map(asdict, clip.steps)),
         "left_out": dict(lost),
     }
     write_json(out / REPORT, data)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import tyro
 
+from ..options import Cut
+
 
 @dataclass(frozen=True)
 class ImportTrackingSettings:
@@ -36,6 +38,13 @@ class ImportTrackingSettings:
     masks: str = ""
     """Folder of masks named as the images; default: alpha or mask beside the images, times parsing/*_neckhead if there are
     any (metrical); seg_og (pixel3dmm); or the alpha channels of the images."""
+
+    cut: Cut = "bust-line"
+    """Part of the person that is replaced by background, since no head model explains it: all below a line through the front of
+    the neck's lower end, as VHAP's export does, or nothing."""
+
+    parsing: str = ""
+    """Folder of label images (19 classes of CelebAMask-HQ) named as the images: clothes are cut by them instead."""
 
     subject: str = ""
     """Name of the subject; default: that of the folder."""

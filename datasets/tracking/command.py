@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import write_json
+from ...bench.manifest import cut_of
 from ...bench.progress import counted
 from ...bench.protocol import evenly_with_ends
 from ...bench.specs import CommandResult
+from ...bench.tflite import LICENCE, WHEEL, fetch_networks
 from .settings import TrackSettings
 from .work import WORK, check_work_folder, make_work_folder
 
@@ -35,6 +38,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
     from ..overlay import draw_overlay
+    from ..steps.masks import without_torso
     from ..tracking_errors import tracking_errors
     from ..video.command import video_to_track
     from ..video.decode import is_video
@@ -42,6 +46,10 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from .network import landmark_source
     from .track import LandmarkSource, check_cameras, track
 
+    if settings.fetch_networks:
+        files = fetch_networks()
+        text = f"Networks of {WHEEL} ({LICENCE}):"
+        return CommandResult("\n".join([text, *map(str, files)]), {"networks": [*map(str, files)]})
     if settings.program != "light":
         return track_with_program(settings, progress)
     out = Path(settings.out)
@@ -58,7 +66,9 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     capture_plan(clip, settings.capture)  # Captures that cannot be rewritten are detected before the fit.
     check_cameras(clip, cameras := [*settings.cameras] or [*clip.cameras])
     notes = {
-        "landmarks": Path(settings.landmarks).name or "vertices of the tracked mesh",
+        "landmarks": video.network
+        if video
+        else Path(settings.landmarks).name or "vertices of the tracked mesh",
         "seed": settings.seed,
     }
     source: LandmarkSource
@@ -70,17 +80,26 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         )
     make_work_folder(work)
     tracked = track(clip, cameras, source, notes=notes, store=work, progress=progress)
+    if video is not None:
+        tracked = tracked._replace(
+            clip=without_torso(tracked.clip, settings.cut, settings.parsing, video.view.image)
+        )
     timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
     overlay = draw_overlay(tracked.clip, timesteps, evenly_with_ends(cameras, COLUMNS))
     write_image(out / PICTURE, overlay)
     union = write_capture(tracked.clip, out, progress)
+    if video is not None:
+        video.data["video"]["frames_used"] = [
+            video.numbers[residual.timestep] for residual in tracked.report.residuals
+        ]
     data: dict[str, Any] = {
         "capture": union.as_posix(),
+        "cut": cut_of(map(asdict, tracked.clip.steps)),
         **notes,
         **(video.data if video else {}),
         **tracked.report.to_json(),
     }
-    lines = [*(video.lines if video else []), *_text(tracked)]
+    lines = [*(video.lines if video else []), *_text(tracked, video.numbers if video else None)]
     if exact is not None:
         errors = tracking_errors(tracked.clip, exact)
         data["errors_mm"] = {name: error._asdict() for name, error in errors.items()}
@@ -90,12 +109,24 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     return CommandResult("\n".join([*lines, f"Capture: {union}"]), data)
 
 
-def _text(tracked: Tracked) -> list[str]:
-    summary = tracked.report.summary()
-    timesteps = counted(len(tracked.report.residuals), "timestep")
-    cameras = counted(len(tracked.report.cameras), "camera")
+def _text(tracked: Tracked, numbers: Sequence[int] | None) -> list[str]:
+    """Lines of a summary; timesteps are those of the input, of a video the ``numbers`` of its frames."""
+    from ..video.command import listed
+
+    report, summary = tracked.report, tracked.report.summary()
+    timesteps = counted(len(report.residuals), "timestep")
+    cameras = counted(len(report.cameras), "camera")
+    total = len(report.residuals) + len(report.left_out)
+    lines = [f"{timesteps} of {total} tracked, {cameras}, {summary['seconds_per_timestep']:.2f} s a timestep"]
+    for name, found, why in (
+        ("left out", report.without_landmarks, "where no landmarks fit the head model"),
+        ("left out", report.outliers, "whose fit differs from that of the neighbours"),
+        ("repeated", report.fitted_again, "whose first fit differed from that of the neighbours"),
+    ):
+        if found:
+            lines.append(f"  {name}   {listed([numbers[one] if numbers else one for one in found])}, {why}")
     return [
-        f"{timesteps}, {cameras}, {summary['seconds_per_timestep']:.2f} s a timestep",
+        *lines,
         f"  landmarks  {summary['landmarks_px']:.2f} pixels root mean square",
         f"  colours    {summary['colour_levels']:.2f} levels of 255, median",
     ]

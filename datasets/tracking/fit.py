@@ -94,7 +94,7 @@ class Fitted(NamedTuple):
 
     state: HeadState
     landmarks: FloatArray
-    """(T,) root mean square distance of the landmarks before the last step, pixels."""
+    """(T,) root mean square distance of the landmarks before the last step, pixels; 0 where none was used."""
     colours: FloatArray
     """(T,) median difference of a colour from that of its point, 8-bit levels."""
 
@@ -160,7 +160,8 @@ class Fitter:
     def add_landmarks(
         self, equations: NormalEquations, rig: PointRig, state: HeadState, leave_out: bool = True
     ) -> FloatArray:
-        """Add the landmarks to the equations; return their root mean square distance at each timestep, (T,) pixels."""
+        """Add the landmarks to the equations; return their root mean square distance at each timestep, (T,) pixels;
+        0 where none is used."""
         distance = np.zeros(len(state.poses))
         for row, pixels in enumerate(self.landmarks.pixels):
             posed = rig.linearised(state.shape, state.poses[row])

@@ -51,8 +51,8 @@ def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, s
     side : float
         Longer side of the camera's whole picture in pixels of ``camera``, before it was cropped.
     """
-    chosen = np.unique(np.linspace(0, len(landmarks.pixels) - 1, FRAMES).astype(int))
-    part = landmarks._replace(pixels=landmarks.pixels[chosen])
+    part = landmarks.of(landmarks.seen)
+    part = part.of(np.unique(np.linspace(0, len(part.pixels) - 1, FRAMES).astype(int)))
     tried = side * np.array(TRIED)
     residuals = np.array([_residual(head, camera, part, focal) for focal in tried])
     best = int(residuals.argmin())

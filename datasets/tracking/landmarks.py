@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...bench.contracts import FloatArray, HeadAsset, IntArray
+from ...bench.contracts import BoolArray, FloatArray, HeadAsset, IntArray
 from ..clip import CaptureClip
 from ..head.arrays import region
 from ..head.subject import PosedSubject
@@ -32,6 +32,15 @@ class ImageLandmarks(NamedTuple):
     """(L, 3) barycentric weights."""
     pixels: FloatArray
     """(T, C, L, 2) places, pixels; NaN where a landmark was not found."""
+
+    def of(self, timesteps: IntArray | BoolArray) -> ImageLandmarks:
+        """Those of some timesteps, indices or a mask."""
+        return self._replace(pixels=self.pixels[timesteps])
+
+    @property
+    def seen(self) -> BoolArray:
+        """(T,) whether any landmark was found."""
+        return np.asarray(np.isfinite(self.pixels).any(axis=(1, 2, 3)))
 
 
 def spread_vertices(points: FloatArray, count: int) -> IntArray:

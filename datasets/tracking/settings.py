@@ -16,19 +16,22 @@ from ..video.settings import VideoOptions
 class TrackSettings(VideoOptions, CaptureOptions):
     """Settings of ``headbench track``."""
 
-    capture: Annotated[str, tyro.conf.Positional]
+    capture: Annotated[str, tyro.conf.Positional] = ""
     """Capture in a layout that a reader knows, whose images, cameras and head model are used; or the file of a video of one
-    person, with --head, --landmarks, and --segmentation or --masks."""
+    person."""
 
-    out: str
+    out: str = ""
     """Folder for the tracked capture, track.json and overlay.png."""
 
     cameras: tuple[str, ...] = ()
     """Ids of the cameras whose images are used; default: all. One is enough."""
 
     landmarks: str = ""
-    """MediaPipe's face_landmark.tflite, which needs ai-edge-litert; default: vertices of the capture's own tracked mesh with
-    the error of such a network."""
+    """MediaPipe's face_landmark.tflite, which needs ai-edge-litert; default: of a video, that of --fetch-networks; of a capture,
+    vertices of its own tracked mesh with the error of such a network."""
+
+    fetch_networks: bool = False
+    """Only download MediaPipe's networks of landmarks, faces and masks (Apache-2.0) into the cache, where videos use them."""
 
     embedding: str = ""
     """Capture of another subject with exact tracking in the same head model, from which the positions of the network's
@@ -52,12 +55,16 @@ class TrackSettings(VideoOptions, CaptureOptions):
     dependent = (
         DependentOptions(("landmarks", "embedding", "cameras", "against", "seed"), "program", ("light",)),
         DependentOptions(
-            ("segmentation", "masks", "focal", "rate", "longest", "size"), "program", ("light",)
+            ("segmentation", "masks", "cut", "parsing", "focal", "rate", "longest", "size"),
+            "program",
+            ("light",),
         ),
         DependentOptions(("python",), "checkout"),
     )
 
     def __post_init__(self) -> None:
         self.check_video()
+        if self.fetch_networks == bool(self.capture or self.out) or bool(self.capture) != bool(self.out):
+            raise ValueError("CAPTURE and --out, or --fetch-networks alone, are needed")
         if (self.program == "light") != (not self.checkout):
             raise ValueError("--with vhap or pixel3dmm and --checkout need each other")

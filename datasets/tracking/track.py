@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,11 +20,14 @@ from ..clip import CaptureClip
 from .fit import Fitter
 from .images import FrameStack
 from .landmarks import ImageLandmarks
+from .outliers import outliers
 from .rig import PoseColumns
 from .solve import HeadState
 from .views import Views
 from .work import TRACKER_VERSION
 
+LEAST_TRACKED = 0.5
+"""Minimum fraction of timesteps that must be tracked."""
 MOST_TIMESTEPS, MOST_PIXELS = 64, 2.5e8
 """Timesteps, and pixels of all cameras, that are fitted together; this bounds the memory."""
 
@@ -44,12 +47,24 @@ class TimestepResidual(NamedTuple):
 
 @dataclass(frozen=True)
 class TrackingReport:
-    """Residuals and time of a tracking."""
+    """Residuals and time of a tracking. Timesteps are those of the clip before it was tracked."""
 
     cameras: tuple[str, ...]
     residuals: tuple[TimestepResidual, ...]
+    """Of the timesteps that are tracked."""
+    without_landmarks: tuple[int, ...]
+    """Timesteps that are left out because no camera shows landmarks that fit the head model."""
+    outliers: tuple[int, ...]
+    """Timesteps that are left out because their fit, also a second one, differs from that of their neighbours."""
+    fitted_again: tuple[int, ...]
+    """Timesteps whose fit was repeated from the pose of a neighbour and then agreed."""
     seconds: float
     """Time of the fit, including reading images but not landmark detection."""
+
+    @property
+    def left_out(self) -> list[int]:
+        """Timesteps that the tracked clip does not have."""
+        return sorted(self.without_landmarks + self.outliers)
 
     def to_json(self) -> dict[str, Any]:
         """The summary and every timestep as plain values."""
@@ -59,6 +74,7 @@ class TrackingReport:
         """Means over the timesteps."""
         return {
             "timesteps": len(self.residuals),
+            "left_out": len(self.left_out),
             "seconds_per_timestep": self.seconds / len(self.residuals),
             "landmarks_px": float(np.mean([residual.landmarks_px for residual in self.residuals])),
             "colour_levels": float(np.mean([residual.colour_levels for residual in self.residuals])),
@@ -93,6 +109,8 @@ def track(
 ) -> Tracked:
     """Estimate shape and poses from images; recorded as a step. The static offset becomes zero.
 
+    Timesteps without landmarks, and those whose fit remains an outlier, are not in the clip that is returned.
+
     Neither shape, poses nor static offset of the clip are used, other than by ``source``. The shape is estimated with the
     first timesteps, spread over the clip, and kept for the others.
 
@@ -120,49 +138,117 @@ def track(
     views = Views([clip.cameras[name] for name in cameras])
     most = min(MOST_TIMESTEPS, max(1, int(MOST_PIXELS // views.sizes.prod(axis=1).sum())))
     blocks = -(-len(timesteps) // most)
-    seen = [
-        [camera.id, camera.width, camera.height, camera.K, camera.world_to_camera] for camera in views.cameras
-    ]
-    poses: dict[int, FloatArray] = {}
-    residuals: list[TimestepResidual] = []
-    shape: FloatArray | None = None
-    seconds = 0.0
+    fits = _Fits(clip, [*cameras], views, store)
+    pixels: dict[int, FloatArray] = {}
     for block in range(blocks):
-        part = timesteps[block::blocks]
-        landmarks = source(part)
-        if not np.isfinite(landmarks.pixels).any():
-            raise InputError(where, "landmarks", "a face in some image", "none")
-
-        def report_block(done: int, total: int, note: str = "", block: int = block) -> None:
-            progress(block * total + done, blocks * total, f"tracking, {note}")
-
-        fit = partial(_fit_block, clip, cameras, views, part, landmarks, shape, report_block)
-        if store is None:
-            fitted = fit()
-        else:
-            mark = digest(
-                TRACKER_VERSION, clip.fingerprint, clip.head.fingerprint(), seen, part, *landmarks, shape
-            )
-            fitted = cached_arrays(store / f"part-{block:05d}.npz", mark, _PART, fit, {"T": len(part)})
-        shape = fitted["shape"]
-        seconds += float(fitted["seconds"])
-        rows = fitted["landmarks"].tolist(), fitted["colours"].tolist()
-        residuals += [TimestepResidual(*row) for row in zip(part, *rows)]
-        poses |= dict(zip(part, fitted["poses"]))
-    assert shape is not None
-    state = HeadState(np.asarray(shape, np.float32), np.stack([poses[timestep] for timestep in timesteps]))
-    report = TrackingReport(tuple(cameras), tuple(sorted(residuals)), seconds)
-    tracked = PoseColumns.of(clip.head).poses(state.poses, clip.head, clip.subject, timesteps)
+        landmarks = source(part := timesteps[block::blocks])
+        pixels |= dict(zip(part, landmarks.pixels))
+        if landmarks.seen.any():
+            part = [timestep for timestep, seen in zip(part, landmarks.seen) if seen]
+            part_progress = partial(_part_progress, progress, block, blocks)
+            fits.fit(f"part-{block:05d}", part, landmarks.of(landmarks.seen), part, part_progress)
+    if not fits.poses:
+        raise InputError(where, "landmarks", "a face in some image that fits the head model", "none")
+    first = fits.outliers()
+    good = sorted({*fits.poses} - first)
+    half = max(1, most // 2)
+    parts = [sorted(first)[start : start + half] for start in range(0, len(first), half)] if good else []
+    for number, wrong in enumerate(parts):
+        nearest = {timestep: min(good, key=lambda one: abs(one - timestep)) for timestep in wrong}
+        fits.poses |= {timestep: fits.poses[one] for timestep, one in nearest.items()}
+        # Others give the colours of the points.
+        others = sorted(good, key=lambda one: min(abs(one - timestep) for timestep in wrong))[:half]
+        part = sorted([*wrong, *others])
+        again = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in part]))
+        part_progress = partial(_part_progress, progress, blocks + number, blocks + len(parts))
+        fits.fit(f"again-{number:05d}", part, again, wrong, part_progress)
+    last = fits.outliers()
+    kept = sorted({*fits.poses} - last)
+    report = TrackingReport(
+        tuple(cameras),
+        tuple(TimestepResidual(timestep, *fits.residuals[timestep]) for timestep in kept),
+        tuple(sorted({*timesteps} - {*fits.poses})),
+        tuple(sorted(last)),
+        tuple(sorted(first - last)),
+        fits.seconds,
+    )
+    if len(kept) < LEAST_TRACKED * len(timesteps):
+        expected = f"timesteps of which at least {LEAST_TRACKED:.0%} can be tracked"
+        raise InputError(where, "", expected, f"{len(kept)} of {len(timesteps)}")
+    state = HeadState(
+        np.asarray(fits.shape, np.float32), np.stack([fits.poses[timestep] for timestep in kept])
+    )
+    tracked = PoseColumns.of(clip.head).poses(state.poses, clip.head, clip.subject, kept)
     parameters = {"cameras": [*cameras], **(notes or {}), "residual": report.summary()}
     del parameters["residual"]["seconds_per_timestep"]  # which is different each time
-    derived = clip.derive(
+    derived = without_timesteps(clip, report.left_out).derive(
         "track",
         parameters,
         shape=state.shape,
         static_offset=np.zeros(np.shape(clip.head.template), np.float32),
-        poses=dict(zip(timesteps, tracked)),
+        poses=dict(zip(kept, tracked)),
     )
     return Tracked(derived, report)
+
+
+def without_timesteps(clip: CaptureClip, left_out: Collection[int]) -> CaptureClip:
+    """A clip without the frames of some timesteps. Raises `InputError` if no training frame remains."""
+    splits = {
+        name: tuple(key for key in keys if key.timestep not in left_out) for name, keys in clip.splits.items()
+    }
+    if clip.splits["train"] and not splits["train"]:
+        raise InputError(f"clip of {clip.subject}", "train", "frames that can be tracked", "none")
+    kept = {key: files for key, files in clip.files.items() if key.timestep not in left_out}
+    excluded = {key: why for key, why in clip.excluded.items() if key.timestep not in left_out}
+    return replace(clip, splits=splits, files=kept, excluded=excluded)
+
+
+def _part_progress(progress: Progress, part: int, parts: int, done: int, total: int, note: str = "") -> None:
+    progress(part * total + done, parts * total, f"tracking, {note}")
+
+
+@dataclass
+class _Fits:
+    """Fits of parts of a clip's timesteps with one shape, which the first part determines."""
+
+    clip: CaptureClip
+    cameras: list[str]
+    views: Views
+    store: Path | None
+    shape: FloatArray | None = None
+    seconds: float = 0.0
+    poses: dict[int, FloatArray] = field(default_factory=dict)
+    """(D,) each."""
+    residuals: dict[int, tuple[float, float]] = field(default_factory=dict)
+
+    def fit(
+        self, name: str, part: list[int], landmarks: ImageLandmarks, taken: list[int], progress: Progress
+    ) -> None:
+        """Fit timesteps, from their poses if there are any, and take the results of some of them."""
+        start = np.stack([self.poses[timestep] for timestep in part]) if part[0] in self.poses else None
+        given = self.clip, self.cameras, self.views, part, landmarks, self.shape, start, progress
+        if self.store is None:
+            fitted = _fit_block(*given)
+        else:
+            seen = [[one.id, one.width, one.height, one.K, one.world_to_camera] for one in self.views.cameras]
+            heads = self.clip.fingerprint, self.clip.head.fingerprint()
+            mark = digest(TRACKER_VERSION, *heads, seen, part, *landmarks, self.shape, start)
+            file = self.store / f"{name}.npz"
+            fitted = cached_arrays(file, mark, _PART, lambda: _fit_block(*given), {"T": len(part)})
+        self.shape = fitted["shape"]
+        self.seconds += float(fitted["seconds"])
+        rows = zip(part, fitted["poses"], fitted["landmarks"].tolist(), fitted["colours"].tolist())
+        for timestep, pose, *residual in rows:
+            if timestep in taken:
+                self.poses[timestep], self.residuals[timestep] = pose, (residual[0], residual[1])
+
+    def outliers(self) -> set[int]:
+        """Timesteps whose fit is one of `outliers`."""
+        fitted = sorted(self.poses)
+        poses = np.stack([self.poses[timestep] for timestep in fitted])
+        residuals = np.array([self.residuals[timestep] for timestep in fitted])
+        wrong = outliers(poses, residuals, PoseColumns.of(self.clip.head))
+        return {timestep for timestep, bad in zip(fitted, wrong) if bad}
 
 
 _PART = {
@@ -180,14 +266,19 @@ def _fit_block(
     part: Sequence[int],
     landmarks: ImageLandmarks,
     shape: FloatArray | None,
+    poses: FloatArray | None,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
-    """Fit some timesteps with a given or a newly estimated shape; returns the arrays of `_PART`."""
+    """Fit some timesteps with a given or a newly estimated shape, from given poses or from those of the landmarks.
+
+    Returns the arrays of `_PART`.
+    """
     begin = time.perf_counter()
     fitter = Fitter(clip.head, views, landmarks)
     images = [clip.image(clip.frame_at[timestep, name]) for timestep in part for name in cameras]
     keep = shape is not None
-    state = fitter.fit_landmarks(fitter.start(shape), keep_shape=keep)
+    state = fitter.start(shape) if shape is None or poses is None else HeadState(shape, poses)
+    state = fitter.fit_landmarks(state, keep_shape=keep)
     fitted = fitter.fit_colours(state, FrameStack(images), keep_shape=keep, progress=progress)
     return {
         "shape": fitted.state.shape,

@@ -9,7 +9,7 @@ from ...bench.io.files import TEMPORARY, check_output_folder, write_text
 
 WORK = ".track"
 """Its name in the folder of ``--out``."""
-TRACKER_VERSION = "1"
+TRACKER_VERSION = "2"
 """Part of the key of intermediate results; raise it when code of the tracker or the reader of videos changes them."""
 _NOTE = "README.txt"
 _TEXT = """headbench track continues from these files after an interruption and deletes them at the end.

@@ -24,9 +24,8 @@ from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.files import digest, digest_file
 from ...bench.io.images import probe_image
-from ...bench.landmark_network import LandmarkNetwork
 from ...bench.protocol import evenly_with_ends
-from ...bench.tflite import open_network
+from ...bench.tflite import fetched_network, open_network
 from ..clip import CaptureClip
 from ..ga.content_digests import content_digests
 from ..head.arrays import HeadArrays
@@ -37,6 +36,7 @@ from ..monocular.track import VIDEO, Track, VideoFrame
 from ..tracking.work import TRACKER_VERSION
 from .background import CHECKED, SAMPLES, Background, check_background, learn_background
 from .decode import TimedFrame, VideoInfo, probe_video, video_frames
+from .detector import FaceFinder
 from .faces import Crop, FoundFaces, crop_around, find_faces
 from .settings import BACKGROUND, MASKLESS, VideoOptions
 
@@ -45,9 +45,8 @@ class SelfieSegmentation:
     """The network of a file."""
 
     def __init__(self, path: Path):
-        remedy = "It is in the wheel of mediapipe 0.10.21, as mediapipe/modules/selfie_segmentation/selfie_segmentation.tflite."
         expected = "a network that segments a person"
-        self._network: Any = open_network(path, expected, remedy)
+        self._network: Any = open_network(path, expected)
         (self._input,), (self._output,) = (
             self._network.get_input_details(),
             self._network.get_output_details(),
@@ -103,18 +102,14 @@ class MaskSource:
     """Masks according to the options."""
 
     def __init__(self, options: VideoOptions):
-        if bool(options.segmentation) == bool(options.masks):
+        if options.segmentation and options.masks:
             expected = "one of --segmentation FILE, --masks FOLDER, --masks background and --masks none"
-            remedy = (
-                "selfie_segmentation.tflite is in the wheel of mediapipe 0.10.21 (Apache-2.0), under "
-                "mediapipe/modules/selfie_segmentation: pip download --no-deps mediapipe==0.10.21, and unpack it."
-            )
-            found = "both" if options.masks else "none of them"
-            raise InputError("command line", "masks of a video", expected, found, remedy)
+            raise InputError("command line", "masks of a video", expected, "both")
         self.options = options
         self.unsure: dict[int, float] = {}
         """Of masks by the background, `HeadMask.unsure` by the number of the frame."""
-        self._network = SelfieSegmentation(Path(options.segmentation)) if options.segmentation else None
+        self._file = None if options.masks else Path(options.segmentation or fetched_network("segmentation"))
+        self._network = SelfieSegmentation(self._file) if self._file else None
         self._background: Background | None = None
 
     def __bool__(self) -> bool:
@@ -131,11 +126,11 @@ class MaskSource:
 
         Raises `InputError` unless a folder of masks has one of the video's size for every frame.
         """
-        if self._network is not None:
-            return digest_file(Path(self.options.segmentation))
+        if self._file is not None:
+            return digest_file(self._file)
         if not self or self.by_background:
             return self.options.masks
-        files = [self._file(number) for number in numbers]
+        files = [self._mask_file(number) for number in numbers]
         for file in files:
             found = probe_image(file)
             if (found.width, found.height) != (info.width, info.height):
@@ -161,14 +156,16 @@ class MaskSource:
     def mask(self, frame: TimedFrame, view: FrameView, face: FloatArray) -> ByteArray:
         """(H, W) 8-bit coverage of the person in the view of a frame with landmarks ``face``, (L, 2) pixels of the frame."""
         if self._network is not None:
-            return view.image(self._network.mask(frame.image))
+            return self._network.mask(view.image(frame.image))  # where the person is larger than in the frame
         if self._background is not None:
             found = self._background.mask(view.image(frame.image), view.points(face))
             self.unsure[frame.number] = found.unsure
             return found.mask
-        return view.image(read_mask(self._file(frame.number), (frame.image.shape[1], frame.image.shape[0])))
+        return view.image(
+            read_mask(self._mask_file(frame.number), (frame.image.shape[1], frame.image.shape[0]))
+        )
 
-    def _file(self, number: int) -> Path:
+    def _mask_file(self, number: int) -> Path:
         names = [f"{number:0{digits}d}{suffix}" for digits in (5, 4) for suffix in (".png", ".jpg")]
         paths = [Path(self.options.masks, name) for name in names]
         return next((path for path in paths if path.exists()), paths[0])
@@ -214,8 +211,7 @@ def open_video(
     path: Path,
     options: VideoOptions,
     head: HeadArrays,
-    network: LandmarkNetwork,
-    network_digest: str,
+    finder: FaceFinder,
     out: Path,
     progress: Progress = no_progress,
 ) -> VideoClip:
@@ -230,8 +226,8 @@ def open_video(
     check_subject(subject, "--subject")
     info = probe_video(path)
     masks = MaskSource(options)
-    mark = digest(TRACKER_VERSION, digest_file(path), network_digest, options.rate, options.longest)
-    faces = find_faces(path, _frames(path, options), network, out / FACES, mark, progress)
+    mark = digest(TRACKER_VERSION, digest_file(path), finder.digest, options.rate, options.longest)
+    faces = find_faces(path, _frames(path, options), finder, out / FACES, mark, progress)
     shown = faces.numbers[faces.found].tolist()
     mark = digest(mark, options.size, masks.prepare(shown, info))
     folder = out / f"{IMAGES}-{mark[:16]}"

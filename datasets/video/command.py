@@ -12,29 +12,38 @@ import numpy as np
 from ...bench.contracts import HeadAsset, Progress
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member, cached_arrays
-from ...bench.io.files import digest, digest_file
-from ...bench.landmark_network import COUNT, LandmarkNetwork
+from ...bench.io.files import digest
+from ...bench.landmark_network import COUNT
 from ...bench.progress import counted
+from ...bench.tflite import fetched_network
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
 from ..tracking.embedding import Embedding
 from ..tracking.focal import FocalLength, estimate_focal
 from ..tracking.network import NetworkLandmarks, head_embedding
 from ..tracking.work import TRACKER_VERSION, make_work_folder
-from .clip import USUAL_FOCAL, VideoClip, open_video
+from .clip import USUAL_FOCAL, FrameView, VideoClip, open_video
+from .detector import FaceFinder
+from .faces import LEAST_SEEN, REMEDY
 
 if TYPE_CHECKING:
     from ..tracking.settings import TrackSettings
 
-NEEDED = ("head", "landmarks")
+EMBEDDED = "2023"
+"""Default head model of a video."""
 _FOCAL = {"pixels": Member("f", ()), "residuals": Member("f", ("N",)), "tried": Member("f", ("N",))}
 
 
 class OpenedVideo(NamedTuple):
-    """A video to be tracked: its clip, its landmarks, and information about it as data and as lines of text."""
+    """A video to be tracked: its clip, the part of its frames there, its landmarks, and information as data and lines of text."""
 
     clip: CaptureClip
+    view: FrameView
     landmarks: NetworkLandmarks
+    network: str
+    """Name of the file of the landmark network."""
+    numbers: list[int]
+    """Numbers in the file of the frames of the clip."""
     data: dict[str, Any]
     lines: list[str]
 
@@ -42,37 +51,37 @@ class OpenedVideo(NamedTuple):
 def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) -> OpenedVideo:
     """The clip of a video with its focal length.
 
-    Its frames and results are stored in ``folder``, from which a later call resumes. Raises `InputError` for options
-    that are missing, and as `open_video`.
+    Its frames and results are stored in ``folder``, from which a later call resumes. Raises `InputError` as `open_video`.
     """
     path = Path(settings.capture)
-    for name in NEEDED:
-        if not getattr(settings, name):
-            raise InputError("command line", f"--{name}", "a value, for the file of a video", "none")
-    named = settings.head or ""
+    named = settings.head or EMBEDDED
     head = target_head(named, "--head")
-    network, weights = LandmarkNetwork(Path(settings.landmarks)), digest_file(Path(settings.landmarks))
+    network = Path(settings.landmarks or fetched_network("landmarks"))
+    finder = FaceFinder(network)
     own = replace(
         settings, head=named if Path(named).exists() else None
     )  # the name of a head is not passed to a reader
     teacher = own.open(settings.embedding, progress) if settings.embedding else None
     make_work_folder(folder)
-    mark = digest(TRACKER_VERSION, weights, head.fingerprint(), teacher.fingerprint if teacher else "")
+    video = open_video(path, settings, head, finder, folder, progress)
+    mark = digest(TRACKER_VERSION, finder.digest, head.fingerprint(), teacher.fingerprint if teacher else "")
     embedding = Embedding(
         **cached_arrays(
             folder / "embedding.npz",
             mark,
             _embedding_arrays(head),
-            lambda: head_embedding(network, head, teacher, progress)._asdict(),
+            lambda: head_embedding(finder.network, head, teacher, progress)._asdict(),
         )
     )
-    video = open_video(path, settings, head, network, weights, folder, progress)
     clip, focal = video.clip, None
     landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
+    found = landmarks(sorted(clip.poses))
+    if (count := int(found.seen.sum())) < LEAST_SEEN * len(found.seen):
+        expected = f"a face whose landmarks fit the head model in at least {LEAST_SEEN:.0%} of the frames"
+        raise InputError(path, "", expected, f"it in {count} of {len(found.seen)}", REMEDY)
     if settings.focal is None:
         (camera,) = clip.cameras.values()
         side = max(video.info.width, video.info.height) * video.view.scale
-        found = landmarks(sorted(clip.poses))
         stored = cached_arrays(
             folder / "focal.npz",
             digest(mark, camera.K, side, found.pixels),
@@ -87,7 +96,13 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
             clip = video.with_focal(focal.pixels / video.view.scale)
             landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
     return OpenedVideo(
-        clip, landmarks, _data(video, settings.focal, focal), _lines(video, settings.focal, focal)
+        clip,
+        video.view,
+        landmarks,
+        network.name,
+        video.faces.numbers[video.faces.found].tolist(),
+        _data(video, settings.focal, focal),
+        _lines(video, settings.focal, focal),
     )
 
 
@@ -134,14 +149,14 @@ def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
     ]
     faces = video.faces
     if video.without_face:
-        lines.append(f"  left out   {_listed(video.without_face)}, where the person's face is missing")
+        lines.append(f"  left out   {listed(video.without_face)}, where the person's face is missing")
     if elsewhere := [one.number for one in faces.again if one.elsewhere]:
         lines.append(
-            f"  again      the face was found again at another place in {_listed(elsewhere)}; check that it is the same person"
+            f"  again      the face was found again at another place in {listed(elsewhere)}; check that it is the same person"
         )
     if faces.others.any():
         lines.append(
-            f"  others     {_listed(faces.numbers[faces.others > 0].tolist())} with a second face. The face that is largest in "
+            f"  others     {listed(faces.numbers[faces.others > 0].tolist())} with a second face. The face that is largest in "
             f"frame {faces.numbers[faces.found][0]} is followed."
         )
     if video.unsure:
@@ -152,6 +167,7 @@ def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
     return lines
 
 
-def _listed(numbers: Sequence[int]) -> str:
+def listed(numbers: Sequence[int]) -> str:
+    """How many frames, and which."""
     shown = ", ".join(map(str, numbers[:8])) + (" ..." if len(numbers) > 8 else "")
     return f"{counted(len(numbers), 'frame')} ({shown})"

@@ -14,11 +14,13 @@ import numpy as np
 from ...bench.contracts import BoolArray, ByteArray, FloatArray, IntArray, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member, store_arrays, stored_arrays
-from ...bench.landmark_network import COUNT, SAME, LandmarkNetwork, face_distance, same_face
+from ...bench.landmark_network import COUNT, SAME, face_distance, same_face
 from .decode import TimedFrame
+from .detector import FaceFinder
 
 LEAST_SEEN = 0.5
 """Minimum fraction of frames with a detected face."""
+REMEDY = "Film one face, upright, lit from the front, at least a tenth of the picture's height."
 ABOVE, BELOW, BESIDE = 1.0, 0.6, 0.8
 """Room around the landmarks in a crop, relative to their height or width: hair, neck, and turns of the head."""
 SEARCHED = 10
@@ -108,7 +110,7 @@ class FaceFollower:
         (COUNT, 2) landmarks of every other face of the latest frame.
     """
 
-    network: LandmarkNetwork
+    finder: FaceFinder
     last: FloatArray | None = None
     last_time: float = 0.0
     lost: bool = True
@@ -139,7 +141,7 @@ class FaceFollower:
             seen = [] if own is None else [own]
             new = [
                 np.asarray(face, np.float32)
-                for face in self.network.find_all(image)
+                for face in self.finder.find_all(image)
                 if not any(same_face(face, known) for known in [*seen, *others])
             ]
             if own is None and new:
@@ -151,7 +153,7 @@ class FaceFollower:
         return own
 
     def _near(self, image: ByteArray, before: FloatArray) -> FloatArray | None:
-        found = self.network.follow(image, before)
+        found = self.finder.follow(image, before)
         return None if found is None else np.asarray(found, np.float32)
 
     def _own(self, new: Sequence[FloatArray], time: float) -> FloatArray | None:
@@ -189,7 +191,7 @@ _STORED = {
 def find_faces(
     path: Path,
     frames: Iterable[TimedFrame],
-    network: LandmarkNetwork,
+    finder: FaceFinder,
     store: Path,
     mark: str,
     progress: Progress = no_progress,
@@ -209,28 +211,27 @@ def find_faces(
     """
     kept = stored_arrays(store, mark, _STORED)
     if kept is None or not kept["finished"]:
-        kept = _search(frames, network, kept, store, mark, progress)
+        kept = _search(frames, finder, kept, store, mark, progress)
     found, count = kept["found"], len(kept["found"])
     seen = int(found.sum())
     if seen < max(1, LEAST_SEEN * count):
         expected = f"the face of one person in at least {LEAST_SEEN:.0%} of the frames"
         said = f"it in {seen} of {count}" if seen else f"no face in any of {count}"
-        remedy = "Film one face, upright, lit from the front, at least a third of the picture's height."
-        raise InputError(path, "", expected, said, remedy)
+        raise InputError(path, "", expected, said, REMEDY)
     pixels = np.where(found[:, None, None], kept["pixels"], np.nan)
     return FoundFaces(kept["numbers"], pixels, kept["others"])
 
 
 def _search(
     frames: Iterable[TimedFrame],
-    network: LandmarkNetwork,
+    finder: FaceFinder,
     kept: dict[str, np.ndarray] | None,
     store: Path,
     mark: str,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
     """Search the frames after those that are ``kept``; the arrays of `_STORED`, which are also stored."""
-    follower = FaceFollower(network)
+    follower = FaceFollower(finder)
     rows: list[_Searched] = []
     if kept is not None:
         faces = [pixels if found else None for pixels, found in zip(kept["pixels"], kept["found"])]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..options import Cut
+
 MASKLESS, BACKGROUND = "none", "background"
 """Values of --masks that are no folder."""
 
@@ -13,12 +15,20 @@ class VideoOptions:
     """Options of `headbench track` for a video file; without effect on captures."""
 
     segmentation: str = ""
-    """Video: MediaPipe's selfie_segmentation.tflite, which finds the person in each frame; needs ai-edge-litert."""
+    """Video: MediaPipe's selfie_segmentation.tflite, which finds the person in each frame; default without --masks: that of
+    --fetch-networks."""
 
     masks: str = ""
     """Video: folder of masks instead, of the video's size, named by the number of the frame in the file (00000.png or 0000.jpg is
     the first frame, also where --rate takes fewer); "background" for the difference from the empty room, which a static camera must show
     for some seconds without a person; or "none" to keep the room behind the person, which then counts in every metric."""
+
+    cut: Cut = "bust-line"
+    """Video: part of the person that is replaced by background, since no head model explains it: all below a line through the
+    front of the neck's lower end, as VHAP's export does, or nothing."""
+
+    parsing: str = ""
+    """Video: folder of label images (19 classes of CelebAMask-HQ) named as --masks: clothes are cut by them instead."""
 
     focal: float | None = None
     """Video: focal length in pixels of its upright frames; default: estimated from the landmarks, which is inexact."""

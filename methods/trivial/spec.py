@@ -42,3 +42,12 @@ NEAREST_CAMERA = MethodSpec(
     config="headbench.methods.trivial.spec:NearestCameraConfig",
     presets=PRESETS,
 )
+
+TEXTURED_MESH = MethodSpec(
+    name="textured-mesh",
+    default=True,
+    summary="The posed mesh with the median colours of the training images: what tracking alone is worth.",
+    implementation="headbench.methods.trivial.textured_mesh:TexturedMesh",
+    trivial=True,
+    presets=PRESETS,
+)

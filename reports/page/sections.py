@@ -26,6 +26,7 @@ from ..pareto.points import SIZE, SPEED
 from ..runs import RunData, RunSet
 from ..statistics.comparisons import subjects_needed
 from ..statistics.paired import LEVEL
+from ..tables import BELOW_CAUSES, not_better
 
 NAMED = 3
 """Maximum number of methods named in a title."""
@@ -55,6 +56,10 @@ def verdict(
     """
     found = Conclusions(_title(runs), facts=_facts(runs))
     methods = runs.ranked
+    tasks = runs.by_camera.tasks
+    if below := not_better(runs.by_camera.rows, metrics, methods, runs.trivial, tasks):
+        found.sentences += [Markup("<b>{}</b>").format(" ".join(below.values())), Markup.escape(BELOW_CAUSES)]
+    methods = tuple(name for name in methods if name not in below)
     for task in runs.by_camera.tasks if metrics else ():
         if scores := _scores(runs.by_camera, methods, metrics[0], task):
             found.sentences.append(_sentence(scores, metrics[0], task, comparisons))
@@ -153,7 +158,7 @@ def _facts(runs: RunSet) -> list[tuple[str, str]]:
         ("Methods", "; ".join(filter(None, [", ".join(runs.ranked), changed, trivial]))),
         ("Subjects", ", ".join(sorted(runs.rows.subjects))),
         ("Frames", ", ".join(frames) + f"; {counted(len(cameras), 'camera')}" * bool(cameras)),
-        ("Images", f"{runs.image_size} pixels" * bool(runs.image_size)),
+        ("Images", f"{runs.image_size} pixels{runs.cut and f', {runs.cut}'}" * bool(runs.image_size)),
         ("Training", f"{presets}; {f'{iterations} iterations; ' * bool(iterations)}{seeds}"),
         ("Machine", ", ".join(filter(None, [runs.machine, cores and f"{cores} cores"]))),
         ("Results of", f"{when.day} {when:%B %Y}" if when else ""),

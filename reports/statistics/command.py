@@ -131,6 +131,7 @@ def compare_methods(
     """`compare_runs` of loaded runs; runs, region and sequences of the settings are ignored."""
     from ..conditions import conditions, note_of
     from ..table_report import COMPARISON
+    from ..tables import BELOW_CAUSES, not_better
     from .comparisons import compare
 
     runs = runs.by_camera
@@ -177,7 +178,9 @@ def compare_methods(
         subjects = counted(max(c.subjects for _, own in found for c in own), "subject")
         how = f"p: exact sign-flip test over {subjects}, with Holm's correction for all pairs of a metric and task."
         below = [how, *notes, runs.cameras, runs.part]
-        text = "\n\n".join([*blocks, "\n".join(filter(None, below))])
+        worse = not_better(runs.rows, runs.metrics, runs.ranked, runs.trivial, runs.tasks)
+        warnings = ["\n".join([*worse.values(), BELOW_CAUSES])] if worse else []
+        text = "\n\n".join([*warnings, *blocks, "\n".join(filter(None, below))])
     data = {"level": settings.level, "comparisons": every}
     return CommandResult(text, data, verbatim=settings.format == "csv")
 

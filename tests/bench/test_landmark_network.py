@@ -40,21 +40,10 @@ def test_a_face_is_found_without_a_start(face, monkeypatch):
     image = np.zeros((240, 300, 3), np.uint8)
     np.testing.assert_array_equal(finder.find(image), face)
     np.testing.assert_array_equal(finder.find(image, near=face + 5), face)
+    crop = network.FaceCrop(face.mean(axis=0) + 9, 120.0, 0.0)
+    np.testing.assert_array_equal(finder.find_in(image, crop), face)
     monkeypatch.setattr(finder, "_run", Face(face + 1000).run, raising=False)
-    assert finder.find(image) is None
-
-
-def test_every_face_is_found_once_the_largest_first(face, monkeypatch):
-    finder = object.__new__(network.LandmarkNetwork)
-    people = [Face(face), Face(np.array([420.0, 120.0]) + 1.2 * (face - face.mean(axis=0)))]
-
-    def run(image, crop):
-        return max((person.run(image, crop) for person in people), key=lambda one: one[1])
-
-    monkeypatch.setattr(finder, "_run", run, raising=False)
-    found = finder.find_all(np.zeros((240, 600, 3), np.uint8))
-    assert [one.mean() for one in found] == [person.points.mean() for person in reversed(people)]
-    assert finder.follow(np.zeros((240, 600, 3), np.uint8), people[1].points + 3) is people[1].points
+    assert finder.find(image) is finder.find_in(image, crop) is None
 
 
 def test_the_crop_is_level_and_around_the_face(face):

@@ -16,7 +16,7 @@ FRAME = {"file_path": "images/1.png", "transform_matrix": RIGID}
 PREPARE = "headbench prepare nersemble --root "
 
 CASES = {
-    "a video": (["my me.MP4"], "my me.MP4", "a video", "my me.MP4' --head"),
+    "a video": (["my me.MP4"], "my me.MP4", "a video", "my me.MP4' --out"),
     "an archive": (["me.tar.gz"], "me.tar.gz", "an archive", "Unpack it"),
     "an image": (["me.jpg"], "me.jpg", "an image", "headbench track"),
     "a head model": (["flame2023.pkl"], "flame2023.pkl", "a file", "--head"),

@@ -31,11 +31,11 @@ from headbench.methods.rgbavatar.config import RGBAvatarConfig
 from headbench.methods.rgbavatar.spec import RGBAVATAR
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, Timeline
-from headbench.methods.trivial.spec import MEAN_IMAGE, NEAREST_CAMERA
+from headbench.methods.trivial.spec import MEAN_IMAGE, NEAREST_CAMERA, TEXTURED_MESH
 
 SPECS = {
     spec.name: spec
-    for spec in (FLASHAVATAR, OURS, GA, GBS, GHA, INSTA, RGBAVATAR, MEAN_IMAGE, NEAREST_CAMERA)
+    for spec in (FLASHAVATAR, OURS, GA, GBS, GHA, INSTA, RGBAVATAR, MEAN_IMAGE, NEAREST_CAMERA, TEXTURED_MESH)
 }
 PRESETS = ("smoke", "quick", "demo", "fast", "gpu", "paper")
 

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
 from headbench.bench.specs import MetricSpec
+from headbench.reports.writers import to_markdown, to_text
 
 from .made_rows import row, table_of
 
@@ -34,8 +35,9 @@ def test_columns_are_tasks_then_the_avatar(make_rows, metrics):
 
 
 def test_a_trivial_baseline_is_listed_apart_and_never_ranked(make_rows, metrics):
-    values = {"floor": 99.0, "a": 1.0, "b": 2.0}
+    values = {"floor": 0.5, "a": 1.0, "b": 2.0}
     table = table_of(make_rows(values), metrics, values, trivial=["floor"])
+    assert not table.warnings
     assert ranks(table, "psnr") == {"a": 2, "b": 1, "floor": None}
     assert [(title, [r.method for r in rows]) for title, rows in table.groups] == [
         ("Methods", ["a", "b"]),
@@ -44,6 +46,20 @@ def test_a_trivial_baseline_is_listed_apart_and_never_ranked(make_rows, metrics)
     alone = table_of(make_rows(values), metrics, ["a", "floor"], trivial=["floor"])
     assert ranks(alone, "psnr") == {"a": None, "floor": None}
     assert "bold" not in alone.caption
+
+
+def test_a_method_below_a_baseline_is_named_first_and_not_ranked(make_rows, metrics):
+    values = {"floor": 1.5, "lower": 0.5, "a": 1.0, "b": 2.0, "c": 3.0}
+    table = table_of(make_rows(values), metrics, values, trivial=["floor", "lower"])
+    assert [(title, [r.method for r in rows]) for title, rows in table.groups] == [
+        ("Methods", ["b", "c"]),
+        ("Not better than a trivial baseline (not ranked)", ["a"]),
+        ("Trivial baselines (not ranked)", ["floor", "lower"]),
+    ]
+    assert ranks(table, "psnr") == {"a": None, "b": 2, "c": 1, "floor": None, "lower": None}
+    assert table.warnings[0] == "a is not better than floor in novel view: PSNR 1.00 against 1.50 dB."
+    assert to_text(table).startswith(table.warnings[0])
+    assert table.warnings[0] in to_markdown(table)
 
 
 def test_missing_and_failed_cells_say_why_and_are_not_ranked(make_rows, metrics):

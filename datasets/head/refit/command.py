@@ -65,14 +65,17 @@ def target_head(name: str, option: str = "--target") -> HeadArrays:
     """The head model that an option names: a version of the procedural head, or a file."""
     from ..loaders import load_head
     from ..procedural.model import procedural_head
+    from ..procedural.surface import PACKAGED
     from ..procedural.versions import VERSIONS
 
     short = [version.removeprefix("procedural") for version in VERSIONS]
     if name in (*short, *VERSIONS):
         return procedural_head(name)
-    if not Path(name).exists():
+    surface = Path(name).parts[-2:] == PACKAGED.parts[-2:]  # from which the procedural heads are made
+    if surface or not Path(name).exists():
         expected = f"{', '.join(short)} or the file of a head model"
-        raise InputError("command line", option, expected, repr(name))
+        remedy = "The embedded head models are given by their version." if surface else ""
+        raise InputError("command line", option, expected, repr(name), remedy)
     return load_head(name)
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 from typing import TypeGuard
 
 from ....bench.contracts import FrameKey, Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import atomic_path
+from ....bench.manifest import cut_of
 from ...clip import CaptureClip
 from ...ga.validate import require_full_grid
 from ...ga.writer import CapturePlan, CaptureWriter, SequencePlan
@@ -85,6 +87,7 @@ def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePla
         novel_view_cameras=sorted(novel),
         background=(background[0], background[1], background[2]),
         synthetic=clip.steps[0].parameters.get("synthetic", {}) if clip.steps else {},
+        cut=cut_of(map(asdict, clip.steps)),
     )
     return plan, index
 

@@ -132,6 +132,22 @@ def _room(good):
     good.without_masks()
 
 
+def _shoulders(good):
+    """The lower part of the pictures is filled by clothes, without their lowest rows and outermost columns."""
+    part = np.s_[int(0.7 * HEIGHT) : -3, 3:-3]
+
+    def fill(value):
+        def change(image, mask):
+            changed = (image if value != 255 else mask).copy()
+            changed[part] = value
+            return changed
+
+        return change
+
+    good.each_image(fill(255), masks=True)
+    good.each_image(fill(90))
+
+
 def _premultiply_again(image, mask):
     alpha = mask[..., None].astype(float) / 255
     added = image - (1 - alpha) * 255
@@ -388,8 +404,9 @@ CAPTURES = (
     (
         Fault("HB405", _tint_one_camera),
         Fault("HB702", _shift_one_camera),
-        Fault("HB703", _shrink),
+        Fault("HB703", _shrink, ("HB704",)),
     ),
+    (Fault("HB704", _shoulders, ("HB701", "HB702")),),
 )
 """Faults that are planted together into one capture, as they do not hide one another."""
 FAULTS = tuple(fault for planted in CAPTURES for fault in planted)

@@ -1,6 +1,6 @@
 """Masks on frames whose true colours are known, and the line below the neck against a filled half-plane."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import cv2
 import numpy as np
@@ -11,10 +11,11 @@ from scipy.ndimage import gaussian_filter
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
+from headbench.bench.manifest import cut_of
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.clip import FrameFiles
 from headbench.datasets.head.subject import PosedSubject
-from headbench.datasets.images import ImageStore
+from headbench.datasets.images import ImageStore, write_image
 from headbench.datasets.steps.masks import (
     NeckLine,
     composite,
@@ -23,6 +24,7 @@ from headbench.datasets.steps.masks import (
     neck_line,
     recomposite,
     set_background,
+    without_torso,
 )
 from headbench.datasets.steps.resolution import align_clip
 
@@ -176,3 +178,28 @@ def test_images_and_masks_end_below_the_line_through_the_neck(clip, tmp_path):
     assert changed > 50  # there was something to cut
     assert max(tilts) - min(tilts) > 0.05
     assert cut.steps[-1].name == "mask_below_neck"
+
+
+def test_clothes_are_cut_by_their_labels(clip, tmp_path):
+    size, labels = (64, 48), np.repeat(np.arange(48, dtype=np.uint8) % 19, 64).reshape(48, 64).T
+    clip = with_pixels(clip, tmp_path, np.full((*size, 3), 90, np.uint8), np.full(size, 200, np.uint8))
+    (tmp_path / "labels").mkdir()
+    for files in clip.files.values():
+        write_image(tmp_path / "labels" / f"{files.image.stem}.png", labels)
+    cut = without_torso(clip, "bust-line", str(tmp_path / "labels"))
+    kept = (labels != 0) & (labels != 16)
+    for key in clip.splits["train"]:
+        np.testing.assert_array_equal(cut.mask(key), np.where(kept, 200, 0))
+        np.testing.assert_array_equal(cut.image(key), np.where(kept[..., None], clip.image(key), 255))
+    assert cut_of([asdict(step) for step in cut.steps]) == "parsing"
+    assert cut_of([asdict(step) for step in without_torso(clip, "bust-line", "").steps]) == "bust-line"
+    assert without_torso(clip, "none", "") is clip
+
+
+@pytest.mark.parametrize("labels", [np.full((64, 48), 19, np.uint8), np.zeros((64, 48, 3), np.uint8)])
+def test_pictures_that_are_no_labels_are_refused(clip, tmp_path, labels):
+    clip = with_pixels(clip, tmp_path, np.zeros((64, 48, 3), np.uint8), None)
+    for files in clip.files.values():
+        write_image(tmp_path / f"{files.image.stem}.png", labels)
+    with pytest.raises(InputError, match="labels from 0 to 18"):
+        without_torso(clip, "none", str(tmp_path))

@@ -67,6 +67,7 @@ def written(recordings, tmp_path_factory):
 
 def imported(source, out, **settings):
     head = settings.pop("head", str(source / HEAD_FILE))
+    settings = {"cut": "none", **settings}  # so that images are those of the video
     return import_tracking(ImportTrackingSettings(str(source), head, str(out), **settings))
 
 
@@ -191,6 +192,22 @@ class Code:
 
     def __reduce__(self):
         return os.mkdir, ("ran",)
+
+
+def test_the_torso_is_cut_unless_it_is_to_stay(results, written, tmp_path):
+    whole = results["metrical"][1].data
+    cut = imported(written["metrical"], tmp_path / "out", cut="bust-line").data
+    assert (whole["cut"], cut["cut"]) == ("", "bust-line")
+    clips = [read_capture(data["capture"]) for data in (whole, cut)]
+    assert [clip.steps[0].parameters.get("cut") for clip in clips] == [None, "bust-line"]
+    rows: list[int] = []
+    for key in clips[0].files:
+        before, after = (clip.mask(key).astype(int) for clip in clips)
+        assert (after <= before).all()
+        lost = np.flatnonzero((after < before).any(axis=1))
+        rows += lost.tolist()
+        assert (lost > np.flatnonzero(before.any(axis=1)).mean()).all()  # below the middle of the head
+    assert rows
 
 
 def edited(change, number=1):

@@ -9,9 +9,11 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.tracking import track as track_module
 from headbench.datasets.tracking.fit import Fitter
 from headbench.datasets.tracking.images import FrameStack
 from headbench.datasets.tracking.landmarks import known_rig_landmarks, spread_vertices
+from headbench.datasets.tracking.outliers import outliers
 from headbench.datasets.tracking.rig import PoseColumns
 from headbench.datasets.tracking.track import track
 from headbench.datasets.tracking.views import Views
@@ -122,6 +124,59 @@ def test_blocks_share_the_shape(clip, frontal, monkeypatch):
     tracked, report = track(clip, frontal[:1], noted)
     assert [len(part) for part in asked] == [3, 2]
     assert sorted(asked[0] + asked[1]) == sorted(tracked.poses) == [one.timestep for one in report.residuals]
+
+
+def test_what_cannot_be_tracked_is_left_out(clip, frontal):
+    timesteps = sorted(clip.poses)
+
+    def lost(part):
+        landmarks = source(clip, frontal[:1])(part)
+        landmarks.pixels[part.index(timesteps[1])] = np.nan
+        return landmarks
+
+    tracked, report = track(clip, frontal[:1], lost)
+    assert report.left_out == [*report.without_landmarks] == [timesteps[1]]
+    assert (
+        sorted(tracked.poses) == [one.timestep for one in report.residuals] == [timesteps[0], *timesteps[2:]]
+    )
+    assert timesteps[1] not in {key.timestep for key in [*tracked.files, *sum(tracked.splits.values(), ())]}
+    assert report.summary()["left_out"] == 1 == tracked.steps[-1].parameters["residual"]["left_out"]
+
+
+def test_a_wrong_fit_is_repeated_from_a_neighbour(clip, frontal, monkeypatch):
+    """In place of the first fit, one that puts the head elsewhere at two timesteps; at one of them it does so again."""
+    timesteps, (kept, lost) = sorted(clip.poses), (1, 3)
+    whole, fit_block = {}, track_module._fit_block
+
+    def moved(*given):
+        fitted, part = fit_block(*given), given[3]
+        wrong = [lost] if whole else [kept, lost]
+        for row, timestep in enumerate(part):
+            if timestep in [timesteps[one] for one in wrong]:
+                fitted["poses"][row, PoseColumns.of(clip.head).translation] += 0.5
+            whole.setdefault(timestep, fitted["poses"][row])
+        return fitted
+
+    monkeypatch.setattr(track_module, "_fit_block", moved)
+    tracked, report = track(clip, frontal[:1], source(clip, frontal[:1]))
+    assert (report.fitted_again, report.outliers) == ((timesteps[kept],), (timesteps[lost],))
+    gap = tracked.poses[timesteps[kept]].translation - frontal[1].poses[timesteps[kept]].translation
+    assert np.abs(gap).max() < 0.02
+
+
+def test_outliers_are_jumps_and_failed_fits():
+    columns = PoseColumns(0, 0)
+    time = np.arange(40)
+    poses, residuals = np.zeros((40, columns.size)), np.full((40, 2), 2.0)
+    poses[:, 1] = np.pi + 0.7 * np.sin(time / 4)  # 100 degrees a second at 25 frames, through half a turn
+    poses[20:, columns.translation] += 1.0  # another recording
+    assert not outliers(poses, residuals, columns).any()
+    poses[5:8, 4] += 0.5  # the neck
+    poses[12, columns.translation] += 0.2
+    residuals[30] = 2.0, 6.0
+    residuals[35:38] = 0.0, 1.0
+    assert np.flatnonzero(outliers(poses, residuals, columns)).tolist() == [5, 6, 7, 12, 30, 35, 36, 37]
+    assert not outliers(poses[::8], residuals[:5], columns).any()  # so few that motion looks like jumps
 
 
 def test_what_is_missing_is_refused(clip):

@@ -20,7 +20,7 @@ from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.images import write_image
 from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
 from headbench.datasets.tracking import command as tracking_command
-from headbench.datasets.tracking import fit, focal, track
+from headbench.datasets.tracking import fit, focal, network, track
 from headbench.datasets.tracking.command import track_capture
 from headbench.datasets.tracking.focal import FocalLength, estimate_focal
 from headbench.datasets.tracking.landmarks import ImageLandmarks, spread_vertices
@@ -109,7 +109,7 @@ def settings(filmed, monkeypatch, tmp_path):
 
     class Network:
         def __init__(self, path):
-            pass
+            self.network, self.digest = self, "digest"
 
         def find(self, image, near=None):
             return known[digest(image)]
@@ -122,7 +122,7 @@ def settings(filmed, monkeypatch, tmp_path):
 
     monkeypatch.setattr(fit, "LEVELS", fit.LEVELS[:1])  # landmarks alone are exact here
     monkeypatch.setattr(focal, "TRIED", focal.TRIED[1:6:2])
-    monkeypatch.setattr(command, "LandmarkNetwork", Network)
+    monkeypatch.setattr(command, "FaceFinder", Network)
     monkeypatch.setattr(video_clip, "crop_around", lambda faces, width, height: Crop(0, 0, width, height))
     given = {
         "head": "2023",
@@ -145,6 +145,7 @@ def test_a_video_becomes_a_capture_of_its_frames(settings, filmed, monkeypatch):
     numbers = [number for number in range(COUNTED) if number != FACELESS]
     assert len(clip.files) == len(numbers)
     assert found.data["video"]["without_face"] == [FACELESS]
+    assert found.data["video"]["frames_used"] == numbers
     again = found.data["video"]["found_again"]
     assert [one["number"] for one in again] == numbers[1:]
     assert all(0 <= one["jump"] < 0.5 for one in again)
@@ -163,10 +164,8 @@ def test_a_video_becomes_a_capture_of_its_frames(settings, filmed, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"masks": ""}, "expected one of --segmentation"),
+        ({"masks": ""}, "fetch-networks"),
         ({"segmentation": "a.tflite"}, "found both"),
-        ({"landmarks": ""}, "--landmarks"),
-        ({"head": None}, "--head"),
         ({"head": "2020"}, "head_model"),
         ({"masks": "nowhere"}, "nowhere"),
         ({"masks": "background"}, "--masks background, found 1"),
@@ -178,13 +177,19 @@ def test_what_is_missing_is_said(settings, changes, named):
         track_capture(settings(**changes))
 
 
+def test_a_face_unlike_the_head_model_is_refused(settings, monkeypatch):
+    monkeypatch.setattr(network, "MOST_MISFIT", 0.0)  # as for a drawn face
+    with pytest.raises(InputError, match="fit the head model in at least 50%.*it in 0 of 11"):
+        track_capture(settings(focal=None))
+
+
 class Stopped(Exception):
     """In place of a kill."""
 
 
 WORKING = {
-    "follow": lambda: command.LandmarkNetwork,
-    "find_all": lambda: command.LandmarkNetwork,
+    "follow": lambda: command.FaceFinder,
+    "find_all": lambda: command.FaceFinder,
     "write_image": lambda: video_clip,
     "estimate_focal": lambda: command,
     "fit_colours": lambda: track.Fitter,

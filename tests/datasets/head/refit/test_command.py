@@ -76,6 +76,7 @@ def test_what_cannot_be_refitted_is_refused(finished):
         (same, "another head model"),
         (replace(settings, out=str(root / "capture")), "outside the capture"),
         (replace(settings, target="no-such-head"), "no-such-head"),
+        (replace(settings, target="any/procedural/head.npz"), "2020, 2023 or the file.*by their version"),
     ):
         with pytest.raises(InputError, match=said):
             refit_capture(changed)
