@@ -5,8 +5,8 @@ upright and square here; matrix and range of the colours are FFmpeg's business.
 
 Formats read:
 
-- Videos. Written by FFmpeg (libavformat 58 and 61). Checked on Zielon/metrical-tracker@c2a51724
-  `input/justin/video.mp4` and felixtaubner/cap4d@1f25e997 `examples/input/animation/example_video.mp4`.
+- Videos. Written by FFmpeg (libavformat 58 and 61). Checked on the three videos of
+  Zielon/metrical-tracker@c2a51724 and that of felixtaubner/cap4d@1f25e997.
 - Videos of phones. Written by their cameras, with a display matrix or HDR. Not checked on a file of the program.
 """
 
