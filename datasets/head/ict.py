@@ -93,11 +93,12 @@ def read_ict(path: Path) -> dict[str, np.ndarray]:
     with reading(folder / INDICES, "lists of vertices by name"):
         landmarks = np.array(indices["idx_to_landmark_verts"], np.int64)
     identities = [name for name in shapes if name.startswith("identity")]
+    names, numbers = np.unique(np.array(materials, dtype=np.str_), return_inverse=True)
     return {
         "v_neutral": neutral,
         "tri_v": triangles,
-        "tri_material": np.array([sorted({*materials}).index(name) for name in materials]),
-        "material_names": np.array(sorted({*materials})),
+        "tri_material": numbers,
+        "material_names": names,
         "expr_names": np.array(expressions),
         "expr_deltas": np.array([deltas[name] for name in expressions]).reshape(-1, *neutral.shape),
         "id_deltas": np.array([deltas[name] for name in identities]).reshape(-1, *neutral.shape),

@@ -1,7 +1,7 @@
 """Frames of a video file: upright, with square pixels, in sRGB's primaries, at a constant rate.
 
 Decoded by PyAV, which unlike OpenCV gives the properties of a stream: pixels that are not square and mirrored ones are made
-upright and square here; matrix and range of the colours are FFmpeg's business.
+upright and square here; FFmpeg converts matrix and range of the colours.
 
 Formats read:
 

@@ -127,9 +127,12 @@ def _samples(fit: Fit, mesh: PosedSubject) -> MeshSamples:
     keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
     pixels = max(camera.width * camera.height for camera in clip.cameras.values())
     keys = evenly_with_ends(keys, max(1, SAMPLES // pixels))
+    meshes = mesh.each(clip, list(dict.fromkeys(key.timestep for key in keys)))
+    timestep, vertices = next(meshes)
     parts: list[MeshSamples] = []
     for number, key in enumerate(keys):
-        (vertices,) = mesh.meshes([clip.poses[key.timestep]])
+        if key.timestep != timestep:
+            timestep, vertices = next(meshes)
         view = rasterize_mesh(vertices, np.asarray(clip.head.faces), clip.cameras[key.camera])
         mask, used = clip.mask(key), view.face >= 0
         if mask is not None:
