@@ -170,11 +170,16 @@ def without_torso(
     if not parsing:
         masked = all(clip.has_mask(key) for key in clip.files)
         return mask_below_neck(clip) if cut == "bust-line" and masked else clip
+    return mask_clothes(clip, label_files(clip, parsing), view)
+
+
+def label_files(clip: CaptureClip, parsing: str) -> dict[FrameKey, Path]:
+    """Label image of each frame in the folder ``parsing``, named as its image. Raises `InputError` as `read_labels`."""
     images = {key: files.image for key, files in clip.files.items()}
     labels = {key: Path(parsing) / f"{path.stem}.png" for key, path in images.items() if path is not None}
     for path in labels.values():
         read_labels(path)
-    return mask_clothes(clip, labels, view)
+    return labels
 
 
 def neck_anchors(head: HeadAsset) -> IntArray:

@@ -38,7 +38,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
     from ..overlay import draw_overlay
-    from ..steps.masks import without_torso
+    from ..steps.masks import label_files, without_torso
     from ..tracking_errors import tracking_errors
     from ..video.command import video_to_track
     from ..video.decode import is_video
@@ -74,6 +74,8 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     source: LandmarkSource
     if video is not None:
         source = video.landmarks
+        if settings.parsing:
+            label_files(clip, settings.parsing)  # Labels that cannot be read are detected before the fit.
     else:
         source = landmark_source(
             clip, cameras, settings.landmarks, teacher, seed=settings.seed, progress=progress

@@ -222,6 +222,15 @@ def finished_calls(monkeypatch, given, stop="", after=0):
     return np.array([*counts.values()]), result
 
 
+def test_labels_are_read_before_the_fit(settings, monkeypatch):
+    def fit_landmarks(*given, **named):
+        raise Stopped
+
+    monkeypatch.setattr(track.Fitter, "fit_landmarks", fit_landmarks)
+    with pytest.raises(InputError, match="no-labels/00000.png"):
+        track_capture(settings(parsing="no-labels"))
+
+
 STOPS = [("follow", 4), ("write_image", 9), ("fit_colours", 1), ("write_json", 0)]
 
 
