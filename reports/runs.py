@@ -334,6 +334,16 @@ class RunSet:
         return (said,) if any(run.manifest.unchecked for run in self.runs) else ()
 
     @property
+    def refitted(self) -> tuple[str, ...]:
+        """A sentence on conditions whose scored frames have other views than those of the capture's tracking."""
+        changed = {c.name for run in self.runs for c in run.manifest.configuration.conditions if c.views}
+        labels = [label for label, record in self.records.items() if record.condition in changed]
+        said = (
+            "each scored frame was fitted to its own picture (camera, jaw, expression) with the avatar frozen"
+        )
+        return (f"{', '.join(labels)}: {said}; not comparable with values of tracked frames.",) * bool(labels)
+
+    @property
     def missing(self) -> tuple[str, ...]:
         """A sentence for each requested task that no run could measure."""
         done = {task for run in self.runs for task in run.tasks}
