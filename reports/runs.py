@@ -334,10 +334,15 @@ class RunSet:
         return (said,) if any(run.manifest.unchecked for run in self.runs) else ()
 
     @property
-    def refitted(self) -> tuple[str, ...]:
-        """A sentence on conditions whose scored frames have other views than those of the capture's tracking."""
+    def with_refit(self) -> tuple[str, ...]:
+        """Labels under conditions that score frames from other views than those of the capture's tracking."""
         changed = {c.name for run in self.runs for c in run.manifest.configuration.conditions if c.views}
-        labels = [label for label, record in self.records.items() if record.condition in changed]
+        return tuple(label for label, record in self.records.items() if record.condition in changed)
+
+    @property
+    def refitted(self) -> tuple[str, ...]:
+        """A sentence on `with_refit`."""
+        labels = self.with_refit
         said = (
             "each scored frame was fitted to its own picture (camera, jaw, expression) with the avatar frozen"
         )
