@@ -66,7 +66,8 @@ def _drawn(
         seen = job.form.key(key)
         view = clip.cameras[seen.camera], clip.poses[seen.timestep]
         if job.condition.views:
-            yield name, avatar.render(*change(avatar, clip, seen, protocol.background), protocol.background)
+            camera, pose = change(avatar, clip, seen, protocol.background)
+            yield name, avatar.render(camera, pose, protocol.background)
         elif isinstance(avatar, ListedFrames):
             views.setdefault(protocol.task, {})[seen] = (name, view, protocol.background)
         else:
