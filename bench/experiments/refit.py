@@ -17,8 +17,10 @@ from .extremes import PoseComponents, head_center, training_poses
 
 UNITS = np.array([0.05] * 3 + [0.005] * 3 + [0.05] * 3)
 """Changes of rotation, translation and jaw (radians, metres, radians) of the same weight as one standard deviation of expression."""
-PRIOR = 1e-5
-"""Mean squared error by which the fit has to fall for a change of one unit, so that pictures decide wherever they show anything."""
+LEVEL = 1 / 255
+"""Differences far above it count by their absolute value, as in FATE, so that shoulders and hair do not outweigh the face."""
+PRIOR = 1e-4
+"""Mean difference by which the fit has to fall for a change of one unit, so that pictures decide wherever they show anything."""
 DIFFERENCE = 0.1
 """Step of finite differences, in units."""
 STEPS = (1.0, 0.3, 0.1)
@@ -55,16 +57,19 @@ class FrameFit:
             self.pose, expression=expression.astype(dtype), jaw=jaw.astype(dtype), timestep=None
         )
 
-    def residuals(self, view: tuple[Camera, HeadPose], size: int) -> FloatArray:
-        """Differences between render and picture, at most ``size`` pixels long, whose squares add up to the mean square."""
-        camera, pose = view
+    def residuals(self, parameters: FloatArray, size: int) -> FloatArray:
+        """Differences between render and picture, one for each pixel and channel.
+
+        Both are reduced to at most ``size`` pixels; avatars are not rendered smaller, since splats grow relative to pixels.
+        """
+        camera, pose = self.view(parameters)
         part = min(1.0, size / max(camera.width, camera.height))
-        width, height = (max(1, round(part * side)) for side in (camera.width, camera.height))
-        truth = cv2.resize(
-            self.picture.astype(np.float32) / 255, (width, height), interpolation=cv2.INTER_AREA
+        sides = (max(1, round(part * camera.width)), max(1, round(part * camera.height)))
+        difference = (
+            self.avatar.render(camera, pose, self.background).rgb - self.picture.astype(np.float32) / 255
         )
-        rgb = self.avatar.render(camera.resized(width, height), pose, self.background).rgb
-        return np.asarray((rgb - truth).ravel(), np.float64) / np.sqrt(truth.size)
+        reduced = cv2.resize(difference, sides, interpolation=cv2.INTER_AREA)
+        return np.asarray(reduced.ravel(), np.float64)
 
     def scored(self, view: tuple[Camera, HeadPose]) -> float:
         """Mean square of the differences of the 8-bit frame at the size of the picture, as metrics see it."""
@@ -72,22 +77,22 @@ class FrameFit:
         return float(np.mean((quantise(rgb).astype(np.float64) - self.picture) ** 2))
 
     def error(self, residuals: FloatArray, parameters: FloatArray) -> float:
-        """Mean square with the prior."""
-        return float(residuals @ residuals + PRIOR * parameters @ parameters)
+        """Mean absolute difference, smooth at 0, with the prior."""
+        return float(np.hypot(residuals, LEVEL).mean() + PRIOR * parameters @ parameters)
 
     def fitted(self, iterations: int, size: int) -> FloatArray:
-        """Parameters after Gauss-Newton iterations with finite differences; the error never rises."""
+        """Parameters after reweighted Gauss-Newton steps with finite differences; the error never rises."""
         at = np.zeros(len(UNITS) + len(self.directions))
-        residuals = self.residuals(self.view(at), size)
+        residuals = self.residuals(at, size)
         for _ in range(iterations):
-            changed = [self.residuals(self.view(at + DIFFERENCE * unit), size) for unit in np.eye(len(at))]
+            changed = [self.residuals(at + DIFFERENCE * unit, size) for unit in np.eye(len(at))]
             slopes = (np.array(changed) - residuals) / DIFFERENCE
-            step = np.linalg.solve(
-                slopes @ slopes.T + PRIOR * np.eye(len(at)), slopes @ residuals + PRIOR * at
-            )
+            weighted = slopes / np.hypot(residuals, LEVEL) / len(residuals)
+            curvature = weighted @ slopes.T + 2 * PRIOR * np.eye(len(at))
+            step = np.linalg.solve(curvature, weighted @ residuals + 2 * PRIOR * at)
             for part in STEPS:
                 tried = at - part * step
-                found = self.residuals(self.view(tried), size)
+                found = self.residuals(tried, size)
                 if self.error(found, tried) < self.error(residuals, at):
                     at, residuals = tried, found
                     break
@@ -104,11 +109,11 @@ def refit(
     *,
     directions: int = 20,
     iterations: int = 3,
-    size: int = 128,
+    size: int = 256,
 ) -> tuple[Camera, HeadPose]:
     """Fit camera, jaw and expression of a scored frame to its own picture; the registered change "test-refit".
 
-    The tracked view is kept if the fitted one does not have a smaller mean squared error at the size of the picture.
+    The mean absolute difference is minimised. The tracked view is kept if the fitted one does not have a higher PSNR, too.
 
     Parameters
     ----------
@@ -117,7 +122,7 @@ def refit(
     iterations : int
         Number of Gauss-Newton iterations, at most.
     size : int
-        Longer side in pixels at which frames are compared during the iterations.
+        Longer side in pixels to which frames are reduced before they are compared during the iterations.
     """
     poses, tracked = training_poses(clip), (clip.cameras[key.camera], clip.poses[key.timestep])
     along = PoseComponents.of(poses, directions).directions
