@@ -334,6 +334,8 @@ class ConditionSpec:
         "derive": a function ``(method spec, avatar folder, folder to write, clip, device, **parameters) -> Avatar``.
         "drive": a function ``(job, avatar, progress, **parameters) -> (Rows, details, files)`` that writes below the run
         folder. Details are JSON values; the rows are kept only as long as the files are unchanged.
+        "views": a function ``(avatar, clip, key, background, **parameters) -> (camera, pose)`` of a scored frame, whose
+        picture it can read; the values are not comparable with those of tracked views.
     implementation : str
         "package.module:function".
     protocols : str
@@ -345,7 +347,7 @@ class ConditionSpec:
 
     name: str
     summary: str
-    kind: Literal["clip", "derive", "drive"]
+    kind: Literal["clip", "derive", "drive", "views"]
     implementation: str
     protocols: str = ""
     metrics: tuple[MetricSpec, ...] = ()

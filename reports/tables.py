@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from ..bench.condition import CONDITION_MARK
 from ..bench.contracts import FrameKey
 from ..bench.engine.scoring import FULL
 from ..bench.progress import counted
@@ -347,12 +348,15 @@ def not_better(
 ) -> dict[str, str]:
     """Sentences by method on those that are not better than a trivial baseline in some task."""
     found: dict[str, str] = {}
+    plain = [
+        name for name in trivial if CONDITION_MARK not in name
+    ] or trivial  # conditions change the task, too
     of_frames = sorted((spec for spec in metrics if spec.per_frame), key=lambda spec: spec.name != DECIDING)
     for spec in of_frames[:1]:
         sign = 1 if spec.higher_is_better else -1
         for task in tasks:
             values = {name: summarise(rows, name, spec.name, task).value for name in (*methods, *trivial)}
-            floors = {name: sign * value for name in trivial if (value := values[name]) is not None}
+            floors = {name: sign * value for name in plain if (value := values[name]) is not None}
             best = max(floors, key=floors.__getitem__, default="")
             for name in methods:
                 value = values[name]

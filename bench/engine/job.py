@@ -109,7 +109,7 @@ class Job:
     def fit_fingerprint(self) -> str:
         """Digest of everything the trained avatar depends on."""
         made_of = {**self.method.identity(), "name": self.label}
-        derived = [asdict(self.condition.derive)] if self.condition.derive else []
+        derived = [asdict(change) for change in (self.condition.derive, self.condition.views) if change]
         return digest(RESULT_FORMAT, made_of, self.seed, self.device, self.form.clip.fingerprint, *derived)
 
     @property

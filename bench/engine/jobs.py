@@ -60,7 +60,7 @@ def make_jobs(
 
     def source_of(clip: Clip, method: ResolvedMethod, condition: Condition, seed: int) -> Cell | None:
         """The cell whose avatar is used: of the source, or the plain one of this run; None for a training."""
-        origin = source or (folder if condition.derive else None)
+        origin = source or (folder if condition.follows else None)
         return None if origin is None else origin.cell(clip.subject, method.spec.name, seed)
 
     kept: dict[str, Any] = {}

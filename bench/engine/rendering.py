@@ -11,6 +11,7 @@ from ..errors import InputError
 from ..io.files import digest
 from ..io.images import quantise, write_png
 from ..protocol import Protocol
+from .config import resolve_change
 from .guard import check_frame
 from .job import DIGESTS, RENDERING, Job, avatar_record, warn_of_damage
 
@@ -59,12 +60,15 @@ def _drawn(
     job: Job, avatar: Avatar, missing: Mapping[str, tuple[Protocol, FrameKey]], report: Progress
 ) -> Iterator[tuple[str, Frame]]:
     """Path and frame of each render; for avatars that render lists, a whole task at a time."""
-    clip = job.form.clip
+    clip, change = job.form.clip, resolve_change(job.condition.views, "views")
     views: dict[str, dict[FrameKey, tuple[str, tuple[Camera, HeadPose], Sequence[float]]]] = {}
     for name, (protocol, key) in missing.items():
         seen = job.form.key(key)
         view = clip.cameras[seen.camera], clip.poses[seen.timestep]
-        if isinstance(avatar, ListedFrames):
+        if job.condition.views:
+            camera, pose = change(avatar, clip, seen, protocol.background)
+            yield name, avatar.render(camera, pose, protocol.background)
+        elif isinstance(avatar, ListedFrames):
             views.setdefault(protocol.task, {})[seen] = (name, view, protocol.background)
         else:
             yield name, avatar.render(*view, protocol.background)

@@ -50,7 +50,7 @@ _REMEDY = (
 def names_of(config: RunConfig, conditions: Iterable[Condition] | None = None) -> dict[str, tuple[str, ...]]:
     """Names of plug-ins in a configuration by key, for `check_trusted`; ``conditions`` replace its own."""
     of_conditions = config.conditions if conditions is None else conditions
-    changes = [change.name for c in of_conditions for change in (c.clip, c.derive, c.drive)]
+    changes = [change.name for c in of_conditions for change in (c.clip, c.derive, c.drive, c.views)]
     return {
         "reader": (config.reader,),
         "conditions": (*changes, config.clip.name),

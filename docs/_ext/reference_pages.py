@@ -601,6 +601,7 @@ def conditions_page() -> str:
             "clip": "changes the clip",
             "derive": "changes a trained avatar",
             "drive": "drives avatars otherwise",
+            "views": "changes the views of scored frames",
         }
         text = f"{escaped(spec.summary)} ({kind[spec.kind]})\n\n{about}\n"
         rows = [

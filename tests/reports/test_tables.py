@@ -49,14 +49,21 @@ def test_a_trivial_baseline_is_listed_apart_and_never_ranked(make_rows, metrics)
 
 
 def test_a_method_below_a_baseline_is_named_first_and_not_ranked(make_rows, metrics):
-    values = {"floor": 1.5, "lower": 0.5, "a": 1.0, "b": 2.0, "c": 3.0}
-    table = table_of(make_rows(values), metrics, values, trivial=["floor", "lower"])
+    values = {"floor": 1.5, "lower": 0.5, "floor+fitted": 2.5, "a": 1.0, "b": 2.0, "c": 3.0}
+    table = table_of(make_rows(values), metrics, values, trivial=["floor", "lower", "floor+fitted"])
     assert [(title, [r.method for r in rows]) for title, rows in table.groups] == [
         ("Methods", ["b", "c"]),
         ("Not better than a trivial baseline (not ranked)", ["a"]),
-        ("Trivial baselines (not ranked)", ["floor", "lower"]),
+        ("Trivial baselines (not ranked)", ["floor", "lower", "floor+fitted"]),
     ]
-    assert ranks(table, "psnr") == {"a": None, "b": 2, "c": 1, "floor": None, "lower": None}
+    assert ranks(table, "psnr") == {
+        "a": None,
+        "b": 2,
+        "c": 1,
+        "floor": None,
+        "lower": None,
+        "floor+fitted": None,
+    }
     assert table.warnings[0] == "a is not better than floor in novel view: PSNR 1.00 against 1.50 dB."
     assert to_text(table).startswith(table.warnings[0])
     assert table.warnings[0] in to_markdown(table)

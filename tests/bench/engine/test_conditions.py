@@ -49,6 +49,11 @@ def test_a_condition_that_cannot_be_had_is_refused(config, toy, condition, match
             "nothing is trained",
         ),
         ({"conditions": [{"name": "c", "budget": "1/2"}], "source": "run"}, "nothing is trained"),
+        ({"conditions": [{"name": "c", "views": {"name": "test-refit"}}]}, "or a source that names"),
+        (
+            {"conditions": [{"name": "c", "drive": {"name": "d"}, "views": {"name": "v"}}], "source": "r"},
+            "both",
+        ),
         ({"conditions": [{"name": "c", "clip": {"name": "cameras"}}], "source": "run"}, "nothing is trained"),
     ],
 )
