@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...bench.specs import MethodSpec, ResolutionRule
+from ...bench.specs import Mechanism, MethodSpec, ResolutionRule
 from ..shared.config import PAPER_ITERATIONS
 
 SHORT: dict[str, Any] = {
@@ -49,6 +49,8 @@ SHORT: dict[str, Any] = {
 }
 """Settings of the short presets, which scale with the capture, for CPUs (docs/explanation/methods/gha.md)."""
 
+NO_EXPRESSION = {"displacement_scale": 0.0, "appearance_margin": -0.5, "expression_noise": 0.0}
+"""Without deformation, and colours and attributes by the middle of each driving value's range."""
 SHORT_PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {
         "budget": {"iterations": 60},
@@ -79,6 +81,10 @@ GHA = MethodSpec(
     config="headbench.methods.gha.config:GHAConfig",
     variants="headbench.methods.avatars.derived.recipes:gha_variants",
     needs="headbench.methods.shared.needs:splats",
+    ablations={"no-expression": NO_EXPRESSION},
+    mechanism=Mechanism(
+        "expression networks", "position, opacity and colour by the expression", "no-expression"
+    ),
     presets={
         **SHORT_PRESETS,
         "gpu": {"budget": {"iterations": 30_000}},

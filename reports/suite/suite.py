@@ -269,6 +269,7 @@ AVATAR_TABLES = {
         "coded_change",
     ),
     "speed": ("fps", "fps_one_thread", "fps_without_head", "processor_time"),
+    "mechanism": ("dynamic_splats", "opacity_range", "color_range", "position_range"),
 }
 """Metrics of the tables without frames, by layout."""
 
