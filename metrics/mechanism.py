@@ -73,7 +73,8 @@ def dynamic_splats(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) 
         for name, values in changes.values.items():
             if name not in THRESHOLDS:
                 raise InputError("avatar", "changes()", f"quantities among {', '.join(THRESHOLDS)}", name)
-            columns = np.asarray(values, np.float64).reshape(len(values), -1)
+            columns = np.asarray(values, np.float64)
+            columns = columns[:, None] if columns.ndim == 1 else columns
             least[name] = np.minimum(least.get(name, columns), columns)
             most[name] = np.maximum(most.get(name, columns), columns)
         if changes.penalised is not None:

@@ -49,8 +49,8 @@ SHORT: dict[str, Any] = {
 }
 """Settings of the short presets, which scale with the capture, for CPUs (docs/explanation/methods/gha.md)."""
 
-NO_EXPRESSION = {"displacement_scale": 0.0, "appearance_margin": -0.5, "expression_noise": 0.0}
-"""Without deformation, and colours and attributes by the middle of each driving value's range."""
+NO_EXPRESSION = {"near_squared": 0.0, "far_squared": 1e-12, "motion_steps": 0, "motion_weight": 0.0}
+"""Every point, and not only those far from the landmarks, depends on the head's pose alone."""
 SHORT_PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {
         "budget": {"iterations": 60},
