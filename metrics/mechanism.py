@@ -7,16 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..bench.contracts import (
-    Avatar,
-    BoolArray,
-    Camera,
-    ChangingAvatar,
-    FloatArray,
-    HeadPose,
-    Measurement,
-)
-from ..bench.errors import InputError, UnavailableError
+from ..bench.contracts import Avatar, BoolArray, Camera, ChangingAvatar, FloatArray, HeadPose, Measurement
+from ..bench.errors import UnavailableError
 from ..bench.specs import DYNAMIC, MetricSpec
 
 THRESHOLDS = {"opacity": 0.05, "color": 0.05, "position": 0.5}
@@ -71,15 +63,12 @@ def dynamic_splats(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) 
     for _, pose in workload:
         changes = avatar.changes(pose)
         for name, values in changes.values.items():
-            if name not in THRESHOLDS:
-                raise InputError("avatar", "changes()", f"quantities among {', '.join(THRESHOLDS)}", name)
-            columns = np.asarray(values, np.float64)
-            columns = columns[:, None] if columns.ndim == 1 else columns
-            least[name] = np.minimum(least.get(name, columns), columns)
-            most[name] = np.maximum(most.get(name, columns), columns)
+            least[name] = np.minimum(least.get(name, values), values)
+            most[name] = np.maximum(most.get(name, values), values)
         if changes.penalised is not None:
             penalised = changes.penalised + (0 if penalised is None else penalised)
-    ranges = {name: (most[name] - least[name]).max(axis=1) for name in most}
+    spans = {name: most[name] - least[name] for name in most}
+    ranges = {name: span if span.ndim == 1 else span.max(axis=1) for name, span in spans.items()}
     count = len(next(iter(ranges.values()), ()))
     found = _summary(ranges, np.ones(count, bool), "")
     if penalised is not None:

@@ -50,7 +50,7 @@ def test_a_trivial_baseline_is_listed_apart_and_never_ranked(make_rows, metrics)
     assert "bold" not in alone.caption
 
 
-def test_a_mechanism_that_is_off_is_named_first_and_none_is_ranked(make_rows, metrics):
+def test_a_mechanism_that_is_off_is_named_and_none_is_ranked(make_rows, metrics):
     spec = MetricSpec("dynamic_splats", "Dynamic", "%", True, 1, "m:m", kind="mechanism")
     found = {"a": [3.0, 4.0], "b": [0.0, 40.0], "c": [8.0, 8.0]}  # means over two subjects
     rows = [
