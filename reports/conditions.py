@@ -122,7 +122,7 @@ def mechanisms(rows: Rows, methods: Sequence[str]) -> tuple[dict[str, str], tupl
         name = name.removesuffix(OFF)
         notes[method] = f"{name}: {meaning}."
         if value < ACTING:
-            off.append(f"{method}: {name}{OFF}: {value:.1f} % dynamic ({meaning}).")
+            off.append(f"{method}: {name}{OFF}: {value:.1f} % of the splats change ({meaning}).")
     return notes, tuple(off)
 
 

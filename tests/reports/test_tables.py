@@ -61,7 +61,7 @@ def test_a_mechanism_that_is_off_is_named_and_none_is_ranked(make_rows, metrics)
         for subject, value in zip("st", values)
     ]
     table = build_table(Rows.of(rows), [spec], [*found], [], protocol_ids={})
-    assert table.warnings == ("a: lines off: 3.5 % dynamic (opacity).",)
+    assert table.warnings == ("a: lines off: 3.5 % of the splats change (opacity).",)
     assert {cell.rank for row in table.rows for cell in row.cells} == {None}
     assert table.notes == ("lines: opacity.",)
     assert to_text(table).startswith(table.warnings[0])
