@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from ...bench.specs import MethodSpec
+from ...bench.specs import Mechanism, MethodSpec
 from ..shared.config import splat_presets
 
 SHORT: dict[str, Any] = {
@@ -29,7 +29,9 @@ ADDITIONS: Mapping[str, Mapping[str, Any]] = {
 ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "no-lines": {"lines": {"enabled": False}},
     "lines-move-splats": {"lines": {"dynamic": ["position", "rotation", "scale"]}},
+    "no-jaw-lines": {"lines": {"jaw_bases": 0}},
     "no-penalty": {"penalty": {"weight": 0.0}},
+    "penalty-1e-3": {"penalty": {"weight": 1e-3, "softness": 0.0}},
     "no-balanced-sampling": {"sampling": {"balanced": False}},
     "harmonics": {"color": "sh"},
     "official": {"lines": {"bounds": "head"}},
@@ -60,6 +62,7 @@ OURS = MethodSpec(
     needs="headbench.methods.shared.needs:splats",
     variants="headbench.methods.avatars.derived.ours_variants:variants",
     ablations=ABLATIONS,
+    mechanism=Mechanism("feature lines", "opacity of the splats inside the lines' box", "no-lines"),
     presets=splat_presets(SHORT, PAPER, quick=390, fast=2_050),
     source="3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations, "
     "CVPR 2025, arXiv 2504.14967",
@@ -76,7 +79,7 @@ OURS_PLUS = replace(
     OURS,
     name="ours-plus",
     default=False,
-    ablations={},
+    ablations={"no-lines": ABLATIONS["no-lines"]},
     summary="The method ours with headbench's additions: weak penalty, colours of splats, smoothed directions, planned sizes.",
     implementation="headbench.methods.ours.method:OursPlus",
     presets=splat_presets(_with_additions(SHORT), _with_additions(PAPER), quick=400, fast=2_300),
