@@ -121,7 +121,7 @@ def test_face_bounds_reach_fewer_splats_than_head_bounds(clip):
 
 
 @pytest.mark.parametrize(
-    "iteration, part", [(60_001, 1e-3), (90_000, 10**-1.5), (120_000, 1.0), (500_000, 1.0)]
+    ("iteration", "part"), [(60_001, 1e-3), (90_000, 10**-1.5), (120_000, 1.0), (500_000, 1.0)]
 )
 def test_the_penalty_rises_geometrically_over_its_ramp(clip, iteration, part):
     """By a factor of 1000, whose logarithm is linear in the iterations since the start of the lines."""
