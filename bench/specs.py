@@ -93,6 +93,37 @@ class ResolutionRule:
 
 
 @dataclass(frozen=True)
+class Mechanism:
+    """The learnt part of a method that its paper proposes, and that its avatars should show.
+
+    Attributes
+    ----------
+    name : str
+        What it is called.
+    meaning : str
+        The quantities of `ChangingAvatar.changes` that it changes, and of what.
+    ablation : str
+        The one of `MethodSpec.ablations` that turns it off.
+    """
+
+    name: str
+    meaning: str
+    ablation: str
+
+    def told(self, dynamic: float) -> str:
+        """Its name, whether it is off, and its meaning; ``dynamic`` is a value of the metric `DYNAMIC`."""
+        return f"{self.name}{OFF if dynamic < ACTING else ''}: {self.meaning}"
+
+
+DYNAMIC = "dynamic_splats"
+"""The metric that measures mechanisms."""
+ACTING = 5.0
+"""Percentage of dynamic splats below which a mechanism is off."""
+OFF = " off"
+"""What follows the name of such a mechanism."""
+
+
+@dataclass(frozen=True)
 class MethodSpec:
     """Description of a method. Loading it imports neither torch nor the implementation.
 
@@ -137,6 +168,8 @@ class MethodSpec:
         ``headbench run sweep``: variants of a trained avatar that need no training; "" for none.
     ablations : Mapping[str, Mapping[str, Any]]
         Settings by name that leave out or change one part of the method, for ``headbench run suite --ablations``.
+    mechanism : Mechanism | None
+        What the metric `DYNAMIC` measures; None for a method whose avatars do not show it (`ChangingAvatar`).
     devices : tuple[str, ...]
         Supported kinds of devices, such as "cpu"; empty means any. A run on another device is
         refused.
@@ -168,6 +201,7 @@ class MethodSpec:
     demo: bool = False
     variants: str = ""
     ablations: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    mechanism: Mechanism | None = None
     renders: str = ""
     devices: tuple[str, ...] = ()
     needs: str = ""
@@ -192,7 +226,7 @@ MAX_DIGITS = 12
 """Decimals shown in tables."""
 
 
-MetricKind = Literal["frame", "regional", "temporal", "sequence", "avatar", "training"]
+MetricKind = Literal["frame", "regional", "temporal", "sequence", "avatar", "mechanism", "training"]
 
 
 @dataclass(frozen=True)
@@ -206,7 +240,7 @@ class MetricSpec:
     kind : MetricKind
         "frame", a `Metric`; "regional", a `RegionalMetric`; "temporal", a `TemporalMetric`; "sequence", a
         `SequenceMetric`, whose value is assigned to each of the frames; "avatar",
-        an `AvatarMetric`; "training", a `TrainingMetric`.
+        an `AvatarMetric`; "mechanism", one whose workload is the poses of training; "training", a `TrainingMetric`.
     detail : str
         Key of the measurement's details that holds the value, in ``unit``; "" for the main value.
         Metrics of an avatar with the same implementation are measured once, together.

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from dataclasses import asdict, replace
 from typing import Any
 
-from ..contracts import Avatar, Camera, CodedAvatar, FrameKey, HeadPose, Measurement
+from ..contracts import Avatar, Camera, Clip, CodedAvatar, FrameKey, HeadPose, Measurement
 from ..errors import HeadbenchError, UnavailableError
 from ..io.files import digest, digest_file
 from ..io.images import read_png
@@ -17,7 +17,7 @@ from ..protocol import Protocol
 from ..registry import get
 from ..rows import ALL, SUSPECT, Row, Rows
 from ..source import code_digest, is_outside
-from ..specs import ConditionSpec, MetricSpec
+from ..specs import DYNAMIC, ConditionSpec, MetricSpec
 from .adaptation import AdaptedClip
 from .config import resolve_change
 from .job import (
@@ -216,6 +216,19 @@ def workload(
     return pairs[:-1] if len(pairs) > 2 and first[0] is last[0] and first[1] is last[1] else pairs
 
 
+MOST_POSES = 200
+"""Timesteps of training over which a mechanism is measured; more are thinned evenly."""
+
+
+def training_poses(clip: Clip) -> list[tuple[Camera, HeadPose]]:
+    """The timesteps of the training split in order, each with its first camera, at most `MOST_POSES`."""
+    cameras = {key.timestep: key.camera for key in sorted(clip.splits["train"], reverse=True)}
+    timesteps = sorted(cameras)
+    count = min(len(timesteps), MOST_POSES)
+    chosen = (timesteps[i * len(timesteps) // count] for i in range(count))
+    return [(clip.cameras[cameras[timestep]], clip.poses[timestep]) for timestep in chosen]
+
+
 def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> dict[str, list[Row]]:
     """Rows of each metric over a protocol's frames of the job's subject."""
     keys = [key for key in protocol.keys if key.subject == job.clip.subject]
@@ -253,6 +266,8 @@ def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement |
     try:
         if spec.kind == "training":
             return metric(job.cell.step("fit") or {})  # type: ignore[no-any-return]
+        if spec.kind == "mechanism":
+            return metric(avatar, training_poses(job.form.clip))  # type: ignore[no-any-return]
         pairs = workload(job.form, job.protocols, job.method.spec.resolution.speed_size)
         if not spec.machine_bound:
             return metric(avatar, pairs)  # type: ignore[no-any-return]
@@ -269,7 +284,10 @@ def _avatar_row(job: Job, spec: MetricSpec, outcome: Measurement | UnavailableEr
     if spec.detail and spec.detail not in outcome.details:
         return _row(job, spec, reason="The avatar does not report it.")
     value = float(outcome.details[spec.detail]) if spec.detail else outcome.value
-    return replace(_row(job, spec, value=value, status="ok"), **_conditions(job, spec, outcome.details))
+    mechanism = job.method.spec.mechanism if spec.name == DYNAMIC else None
+    reason = mechanism.told(value) if mechanism else ""
+    row = _row(job, spec, value=value, status="ok", reason=reason)
+    return replace(row, **_conditions(job, spec, outcome.details))
 
 
 def _conditions(job: Job, spec: MetricSpec, details: Mapping[str, float]) -> dict[str, Any]:

@@ -583,6 +583,7 @@ KINDS = {
     "regional": "measured for each frame and region",
     "temporal": "measured for each frame and its predecessor",
     "sequence": "measured for all frames of a sequence at a camera together",
+    "mechanism": "measured for each avatar over the poses of its training",
 }
 
 

@@ -5,10 +5,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
-from headbench.bench.specs import MetricSpec
+from headbench.bench.rows import Rows
+from headbench.bench.specs import Mechanism, MetricSpec
+from headbench.reports.tables import build_table
 from headbench.reports.writers import to_markdown, to_text
 
-from .made_rows import row, table_of
+from .made_rows import avatar_row, row, table_of
 
 METRIC = MetricSpec("m", "M", "", True, 2, "m:m")
 
@@ -46,6 +48,23 @@ def test_a_trivial_baseline_is_listed_apart_and_never_ranked(make_rows, metrics)
     alone = table_of(make_rows(values), metrics, ["a", "floor"], trivial=["floor"])
     assert ranks(alone, "psnr") == {"a": None, "floor": None}
     assert "bold" not in alone.caption
+
+
+def test_a_mechanism_that_is_off_is_named_and_none_is_ranked(make_rows, metrics):
+    spec = MetricSpec("dynamic_splats", "Dynamic", "%", True, 1, "m:m", kind="mechanism")
+    found = {"a": [3.0, 4.0], "b": [0.0, 40.0], "c": [8.0, 8.0]}  # means over two subjects
+    rows = [
+        avatar_row(
+            method, spec.name, value, subject, reason=Mechanism("lines", "opacity", "none").told(value)
+        )
+        for method, values in found.items()
+        for subject, value in zip("st", values)
+    ]
+    table = build_table(Rows.of(rows), [spec], [*found], [], protocol_ids={})
+    assert table.warnings == ("a: lines off: 3.5 % of the splats change (opacity).",)
+    assert {cell.rank for row in table.rows for cell in row.cells} == {None}
+    assert table.notes == ("lines: opacity.",)
+    assert to_text(table).startswith(table.warnings[0])
 
 
 def test_a_method_below_a_baseline_is_named_first_and_not_ranked(make_rows, metrics):
