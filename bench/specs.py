@@ -110,9 +110,10 @@ class Mechanism:
     meaning: str
     ablation: str
 
-    def told(self, dynamic: float) -> str:
-        """Its name, whether it is off, and its meaning; ``dynamic`` is a value of the metric `DYNAMIC`."""
-        return f"{self.name}{OFF if dynamic < ACTING else ''}: {self.meaning}"
+    def told(self, dynamic: float, condition: str = "") -> str:
+        """Its name, whether it is off or left out by the condition, and its meaning; ``dynamic`` is a value of `DYNAMIC`."""
+        state = OFF if dynamic < ACTING else ""
+        return f"{self.name}{' left out' if condition.startswith(self.ablation) else state}: {self.meaning}"
 
 
 DYNAMIC = "dynamic_splats"

@@ -116,12 +116,13 @@ def mechanisms(rows: Rows, methods: Sequence[str]) -> tuple[dict[str, str], tupl
     for method in methods:
         value = summarise(rows, method, DYNAMIC, "").value
         own = rows.select(method=method, metric=DYNAMIC, task="", region=ALL, seeds=ALL)
-        name, _, meaning = next(filter(None, map(str, own["reason"])), "").partition(": ")
+        reasons = list(filter(None, map(str, own["reason"])))
+        name, _, meaning = "".join(reasons[:1]).partition(": ")
         if value is None or not meaning:
             continue
         name = name.removesuffix(OFF)
         notes[method] = f"{name}: {meaning}."
-        if value < ACTING:
+        if value < ACTING and any(f"{OFF}: " in reason for reason in reasons):
             off.append(f"{method}: {name}{OFF}: {value:.1f} % of the splats change ({meaning}).")
     return notes, tuple(off)
 

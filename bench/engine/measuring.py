@@ -285,7 +285,7 @@ def _avatar_row(job: Job, spec: MetricSpec, outcome: Measurement | UnavailableEr
         return _row(job, spec, reason="The avatar does not report it.")
     value = float(outcome.details[spec.detail]) if spec.detail else outcome.value
     mechanism = job.method.spec.mechanism if spec.name == DYNAMIC else None
-    reason = mechanism.told(value) if mechanism else ""
+    reason = mechanism.told(value, job.condition.name) if mechanism else ""
     row = _row(job, spec, value=value, status="ok", reason=reason)
     return replace(row, **_conditions(job, spec, outcome.details))
 

@@ -52,18 +52,17 @@ def test_a_trivial_baseline_is_listed_apart_and_never_ranked(make_rows, metrics)
 
 def test_a_mechanism_that_is_off_is_named_and_none_is_ranked(make_rows, metrics):
     spec = MetricSpec("dynamic_splats", "Dynamic", "%", True, 1, "m:m", kind="mechanism")
-    found = {"a": [3.0, 4.0], "b": [0.0, 40.0], "c": [8.0, 8.0]}  # means over two subjects
+    lines = Mechanism("lines", "opacity", "none")
+    found = {"a": [3.0, 4.0], "b": [0.0, 40.0], "c": [8.0, 8.0], "none": [0.0, 0.0]}  # of two subjects
     rows = [
-        avatar_row(
-            method, spec.name, value, subject, reason=Mechanism("lines", "opacity", "none").told(value)
-        )
+        avatar_row(method, spec.name, value, subject, reason=lines.told(value, method))
         for method, values in found.items()
         for subject, value in zip("st", values)
     ]
     table = build_table(Rows.of(rows), [spec], [*found], [], protocol_ids={})
     assert table.warnings == ("a: lines off: 3.5 % of the splats change (opacity).",)
     assert {cell.rank for row in table.rows for cell in row.cells} == {None}
-    assert table.notes == ("lines: opacity.",)
+    assert table.notes == ("lines: opacity.", "lines left out: opacity.")
     assert to_text(table).startswith(table.warnings[0])
 
 
