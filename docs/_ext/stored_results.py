@@ -164,8 +164,9 @@ def findings(suite: RunSet, curve: CurveData) -> str:
     return f"""\
 - In the face at the unseen camera `{OURS}` is {behind.difference:.1f} dB behind `{REFERENCE}` (95 % interval {behind.low:.1f} to \
 {behind.high:.1f} dB, {behind.subjects} subjects), with about {fmean(trainings):.0f} processor seconds of training.
-- The feature lines of `{OURS}`, the main idea of its paper, are inactive in these runs: opacities hardly change with the expression, and \
-without lines the face changes by {without.difference:+.2f} dB ({without.low:+.2f} to {without.high:+.2f}, {without.subjects} subjects).
+- The feature lines of `{OURS}`, the main idea of its paper, are off in these runs: without them the face changes by \
+{without.difference:+.2f} dB ({without.low:+.2f} to {without.high:+.2f}, {without.subjects} subjects). Since version 5 they \
+[act](docs/explanation/methods/ours.md#feature-lines).
 - The differences depend on the training time: on held-out timesteps `{OURS}` is {early:.1f} dB behind `{REFERENCE}` after 30 s, and \
 {late:.1f} dB after 120 s ({len(curve.subjects)} subjects, whole frames)."""
 
