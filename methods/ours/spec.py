@@ -34,7 +34,6 @@ ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "lines-move-splats": {"lines": {"dynamic": ["position", "rotation", "scale"]}},
     "no-jaw-lines": {"lines": {"jaw_bases": 0}},
     "no-penalty": {"penalty": {"weight": 0.0}},
-    "no-ramp": {"penalty": {"ramp": 0}},
     "penalty-1e-3": {"penalty": {"weight": 1e-3, "ramp": 0}},
     "no-balanced-sampling": {"sampling": {"balanced": False}},
     "harmonics": {"color": "sh"},
