@@ -332,8 +332,8 @@ class ConditionSpec:
         "clip": ``implementation`` names a function ``(clip, config, **parameters) -> clip``, where ``config`` is the
         `RunConfig`; it stores results of slow steps in ``config.out``.
         "derive": a function ``(method spec, avatar folder, folder to write, clip, device, **parameters) -> Avatar``.
-        "drive": a function ``(job, avatar, progress, **parameters) -> (Rows, details, files)`` that writes below the run
-        folder. Details are JSON values; the rows are kept only as long as the files are unchanged.
+        "drive": a function ``(job, avatar, progress, **parameters) -> (Rows, details)`` that writes below the run folder.
+        Details are JSON values.
     implementation : str
         "package.module:function".
     protocols : str

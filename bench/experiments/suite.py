@@ -18,7 +18,8 @@ from ..engine.config import (
     resolve_methods,
     resolve_metrics,
 )
-from ..engine.run import check_settings, run
+from ..engine.plan import check_settings
+from ..engine.run import run
 from ..errors import InputError
 from ..executors.settings import check_executor
 from ..io.files import write_text

@@ -18,7 +18,8 @@ from ....bench.condition import Condition, Named, label_of
 from ....bench.configuration import build
 from ....bench.contracts import Progress, no_progress
 from ....bench.engine.config import RunConfig, parse_size, resolve_cells
-from ....bench.engine.run import check_settings, run
+from ....bench.engine.plan import check_settings
+from ....bench.engine.run import run
 from ....bench.engine.scoring import FULL
 from ....bench.engine.store import RunFolder
 from ....bench.engine.stored import TRAINING_FILE

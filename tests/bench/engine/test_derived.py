@@ -50,7 +50,7 @@ def test_a_run_killed_before_it_derives_continues(deriving, toy, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("headbench.bench.engine.jobs.derive", killed)
+        patch.setattr("headbench.bench.engine.cell.derive", killed)
         with pytest.raises(KeyboardInterrupt):
             runner.run(deriving)
     trained = len(toy.FITS)
@@ -60,15 +60,6 @@ def test_a_run_killed_before_it_derives_continues(deriving, toy, monkeypatch):
     made = len(toy.MADE)
     runner.run(deriving)
     assert len(toy.MADE) == made  # what is finished stays
-
-
-def test_a_damaged_derived_avatar_is_derived_again(deriving, toy):
-    runner.run(deriving)
-    made, trained = len(toy.MADE), len(toy.FITS)
-    (RunFolder(Path(deriving.out)).cell("subject1", "varying+dark", 0).avatar / "level.txt").write_text("0.9")
-    rows = runner.run(deriving)
-    assert (len(toy.MADE), len(toy.FITS)) == (made + 1, trained)
-    assert set(qualities(rows, "varying+dark")["status"]) == {"ok"}
 
 
 def test_a_failed_training_fails_what_is_derived(deriving, toy):

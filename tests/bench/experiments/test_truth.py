@@ -10,7 +10,7 @@ import pytest
 from headbench.bench.condition import Condition, Named
 from headbench.bench.contracts import Camera, Frame, TrueFrame, no_progress
 from headbench.bench.engine.config import RunConfig, resolve_cells
-from headbench.bench.engine.jobs import make_jobs
+from headbench.bench.engine.plan import make_jobs
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.experiments import extremes
 from headbench.bench.experiments.robustness_settings import ExtremesSettings
