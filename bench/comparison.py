@@ -49,6 +49,7 @@ from .registry import get, resolve
 from .specs import CommandResult
 
 if TYPE_CHECKING:
+    from .engine.store import FinishedRun
     from .rows import Rows
 
 log = logging.getLogger(__name__)
@@ -91,6 +92,8 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
 
     With the preset "quick", avatars are trained beside each other, with one thread each: a training keeps about 1.2 of 2 cores busy.
     """
+    from .engine.run import run as run_comparison  # slow to import
+
     values = parse_assignments(settings.set)
     if "preset" in values:
         raise InputError("command line", "--set preset", "--preset of the demo", str(values["preset"]))
@@ -124,7 +127,8 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
             make = resolve(get("datasets", "synthetic").implementation)
             make(**arguments, progress=report)
         execution = Execution("processes") if beside else None
-        result = _run(comparison, execution, capture_seconds=round(time.perf_counter() - start, 3))
+        seconds = round(time.perf_counter() - start, 3)
+        result = _result(run_comparison(comparison, execution, capture_seconds=seconds))
     return result._replace(text=f"{result.text}\n{ONE_SUBJECT}")
 
 
@@ -225,8 +229,10 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
 
         for clip in open_clips(config):
             check_capture(settings.protocol, clip)
+    from .engine.run import run as run_comparison
+
     with _log_file(Path(config.out)):
-        return _run(config, execution, unchecked=settings.unchecked)
+        return _result(run_comparison(config, execution, unchecked=settings.unchecked))
 
 
 def _configuration_of(run: Path, values: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
@@ -240,14 +246,10 @@ def _configuration_of(run: Path, values: Mapping[str, Any], settings: RunSetting
     return {**asdict(config), "source": str(run)}
 
 
-def _run(config: RunConfig, execution: Execution | None = None, **record: Any) -> CommandResult:
-    from .engine.run import run as run_comparison
-
-    rows = run_comparison(config, execution, **record)
-    text = f"{_table([config.out], fit=True)}\n{closing(Path(config.out), rows)}"
-    return CommandResult(
-        text, {"out": config.out, "failed": rows.failed, "means": means(config.out)}, not rows.failed
-    )
+def _result(run: FinishedRun) -> CommandResult:
+    text = f"{_table([run], fit=True)}\n{closing(run.folder.root, run.rows)}"
+    data = {"out": str(run.folder.root), "failed": run.rows.failed, "means": means(run)}
+    return CommandResult(text, data, not run.rows.failed)
 
 
 def closing(run: Path, rows: Rows) -> str:
@@ -270,14 +272,14 @@ def closing(run: Path, rows: Rows) -> str:
     return "\n".join([first, second, f"Next: {'; '.join([*why, tried, tested])}"])
 
 
-def _table(runs: Sequence[str], **options: Any) -> str:
-    text: str = resolve(get("reports", "table-text").implementation)(list(map(Path, runs)), **options)
+def _table(runs: Sequence[FinishedRun], **options: Any) -> str:
+    text: str = resolve(get("reports", "table-text").implementation)(runs, **options)
     return text
 
 
-def means(run_folder: str) -> list[dict[str, Any]]:
+def means(run: FinishedRun) -> list[dict[str, Any]]:
     """Values of the comparison table for JSON output; None if there is no table."""
-    table = json.loads(_table([run_folder], format="json"))
+    table = json.loads(_table([run], format="json"))
     return [
         {
             **{name: column[name] for name in ("task", "metric")},

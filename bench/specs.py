@@ -297,7 +297,7 @@ class DatasetSpec:
     a keyword ``progress`` is given a `Progress`; one with a keyword ``use_cache`` is given False to read the bytes
     of every file, ignoring its cache. ``reads`` is False for an entry that makes captures instead: its function takes
     ``out`` and settings and writes a capture that another reader reads. Settings whose annotation admits a `Path` name
-    files; a run that was moved together with these files still finds them.
+    files; a run records their absolute paths.
     ``listing`` names a function ``path -> {split: [(timestep, camera), ...]}``: all frames, in the order of the
     capture's own files, by which official repositories number their renders; "" for none.
     ``pose_files`` names a function ``path -> {timestep: file}``: the file with the tracking parameters of each timestep;
@@ -353,10 +353,10 @@ class ConditionSpec:
 
 @dataclass(frozen=True)
 class ReportSpec:
-    """A view of stored results: ``implementation`` names a function ``(run_folder) -> files written``.
+    """A view of results: ``implementation`` names a function ``(run) -> files written`` of a `FinishedRun`.
 
     Every such report is written at the end of a run. ``writes`` is False for one that returns text for printing
-    instead, ``(run_folders, format, ...) -> text``.
+    instead, ``(runs, format, ...) -> text`` of run folders or finished runs.
     """
 
     name: str

@@ -30,7 +30,7 @@ from ..engine.cell import measure, render
 from ..engine.config import ResolvedMethod, RunConfig, RunOptions, default_names, resolve_metrics
 from ..engine.plan import Job
 from ..engine.run import run
-from ..engine.store import Cell, RunFolder
+from ..engine.store import Cell
 from ..engine.stored import avatar_digest, open_avatar
 from ..errors import HeadbenchError, InputError
 from ..executors.remote import run_as_task
@@ -187,7 +187,6 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
             for (task, key), render in sorted(images.items())
         ]
         method = images_method(config.methods[0], digest(digests)[:12])
-    folder = RunFolder(Path(config.out))
 
     def score(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
         if settings.avatar:
@@ -197,11 +196,16 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
         return measure(job, avatar, metrics)
 
     cells = [(method, PLAIN)]
-    rows = run(config, cells=cells, metrics=metrics, clips=clips, each=score, unchecked=True)
-    together = [*([Path(settings.like)] if settings.like else []), folder.root]
+    finished = run(config, cells=cells, metrics=metrics, clips=clips, each=score, unchecked=True)
+    together = [*([Path(settings.like)] if settings.like else []), finished]
     text = resolve(get("reports", "table-text").implementation)(together, fit=True)
-    data = {"out": folder.root, "method": method.spec.name, "version": method.spec.version, "rows": len(rows)}
-    return CommandResult(f"{text}\n{folder.root}", data, not rows.failed)
+    data = {
+        "out": finished.folder.root,
+        "method": method.spec.name,
+        "version": method.spec.version,
+        "rows": len(finished.rows),
+    }
+    return CommandResult(f"{text}\n{finished.folder.root}", data, not finished.rows.failed)
 
 
 def _open(settings: EvaluateSettings, label: str, heads: Mapping[str, str]) -> tuple[RunConfig, list[Clip]]:

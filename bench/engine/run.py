@@ -40,7 +40,7 @@ from .cell import failed_rows, run_cell, stored_rows
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
 from .plan import Job, Plan, make_jobs, make_plan
 from .scoring import compared_over_time, make_metric
-from .store import RunFolder
+from .store import FinishedRun, RunFolder
 
 log = logging.getLogger(__name__)
 RunCell = Callable[[Job, Sequence[MetricSpec]], Rows]
@@ -62,8 +62,8 @@ def run(
     is_locked: bool = False,
     reports: bool = True,
     **record: Any,
-) -> Rows:
-    """Run the cells of a configuration into ``config.out`` and return their rows.
+) -> FinishedRun:
+    """Run the cells of a configuration into ``config.out``.
 
     Everything that can be checked is checked before the first long step: settings, device, methods, captures,
     the output folder, and that no other process uses it. A method that fails is recorded as failed and the
@@ -128,12 +128,14 @@ def run(
         seconds = round(time.perf_counter() - start, 3)
         methods = tuple(replace(method, codec=_codec(method.label, jobs)) for method in manifest.methods)
         manifest = replace(manifest, methods=methods, status="done", seconds=seconds)
-        replace(manifest, peak_memory_bytes=peak_memory_bytes()).write(folder.manifest)
+        manifest = replace(manifest, peak_memory_bytes=peak_memory_bytes())
+        manifest.write(folder.manifest)
+        finished = FinishedRun(folder, manifest, rows, {clip.subject: clip for clip in plan.clips})
         if reports:
             log.info("writing tables, pictures and the report")
-            write_reports(root)
+            write_reports(finished)
         log.info("finished in %s: %s", duration(time.perf_counter() - start), root)
-        return rows
+        return finished
 
 
 def planned_cells(config: RunConfig) -> dict[str, str]:
@@ -186,7 +188,7 @@ def _codec(label: str, jobs: Sequence[Job]) -> str | None:
     return "; ".join(sorted(found)) if found else None
 
 
-def write_reports(run_folder: Path) -> list[Path]:
+def write_reports(run: FinishedRun) -> list[Path]:
     """Write every registered report of a finished run. One that fails is logged and the others are written."""
     written: list[Path] = []
     for name, plugin in discover("reports").items():
@@ -194,7 +196,7 @@ def write_reports(run_folder: Path) -> list[Path]:
             log.warning("report %r of %s is broken: %s", name, plugin.origin, plugin.error)
         elif plugin.spec.writes:
             try:
-                written += resolve(plugin.spec.implementation)(run_folder)
+                written += resolve(plugin.spec.implementation)(run)
             except (HeadbenchError, OSError) as error:
                 log.error("report %r of %s failed: %s; the rows are complete", name, plugin.origin, error)
             except Exception:

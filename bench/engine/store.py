@@ -19,13 +19,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from typing_extensions import TypedDict
 
-from ..contracts import FrameKey
+from ..contracts import Clip, FrameKey
 from ..errors import InputError
 from ..executors.outcome import TaskOutcome, read_record, record_path, update_record
 from ..io.documents import checked
@@ -167,3 +168,13 @@ class RunFolder:
                 names = ", ".join(sorted(known)), ", ".join(sorted(found - known))
                 raise InputError(self.rows, what, f"those of {self.manifest.name}: {names[0]}", names[1])
         return rows
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedRun:
+    """A run in memory: what its reports are made of. ``clips`` are its captures by subject."""
+
+    folder: RunFolder
+    manifest: Manifest
+    rows: Rows
+    clips: Mapping[str, Clip]

@@ -60,7 +60,7 @@ def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) ->
             source=settings.run,
         )
         clips = list({job.clip.subject: job.clip for job in jobs}.values())
-        rows = run(config, execution, clips=clips, is_locked=True, reports=False)
+        rows = run(config, execution, clips=clips, is_locked=True, reports=False).rows
         _write_record(out, drive, rows, settings.others)
         shown: CommandResult = resolve(get("reports", "robustness").implementation)(out)
         return shown

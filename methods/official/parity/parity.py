@@ -152,7 +152,7 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
     with log_to_file(out / "parity.log"):
         if settings.data is None:
             _make_capture(settings, out, progress)
-        rows = run(config, settings.execution)
+        rows = run(config, settings.execution).rows
     differences = differences_of(rows, native, official, config.seeds, condition)
     run_folder = RunFolder(Path(config.out))
     cells = {

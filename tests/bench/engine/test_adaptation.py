@@ -63,7 +63,7 @@ def test_renders_of_the_adapted_clip_are_brought_back(config, toy, monkeypatch, 
         declare(monkeypatch, toy, name, resolution=TWICE)
     methods = ("toy_plugin:MIRROR", "toy_plugin:METHOD")
     run = dataclasses.replace(config, methods=methods, heads={"flame2020": "/somewhere"}, seeds=(0, 1))
-    assert runner.run(run).failed == []
+    assert runner.run(run).rows.failed == []
     assert toy.ADAPTED == ["subject1"]  # once for both, whose needs are equal
     assert toy.WORKLOAD_SIZES == {(32, 24)}  # at which speed is measured
     for key in toy.ToyClip("subject1").splits["novel_view"]:
@@ -135,7 +135,7 @@ def test_a_reduced_comparison_has_another_size_and_another_hash(config, toy):
     record = {}
     for divide in (1, 2):
         chosen = dataclasses.replace(config, divide=divide, out=f"{config.out}{divide}")
-        assert runner.run(chosen).failed == []
+        assert runner.run(chosen).rows.failed == []
         manifest = manifest_of(chosen)
         record[divide] = RunFolder(Path(chosen.out)).read_manifest().protocols["novel_view"]
         # Whoever opens the captures of a run again, as reports do, sees what was measured.

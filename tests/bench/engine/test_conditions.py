@@ -64,7 +64,7 @@ def test_a_part_of_the_clip_out_of_range_fails_its_cell(config):
 def test_an_avatar_of_other_settings_is_no_source(config, toy):
     runner.run(config)
     driven = replace(config, out=f"{config.out}-2", source=config.out)
-    assert runner.run(driven).failed == []
+    assert runner.run(driven).rows.failed == []
     settings = {"toy": {"level": 0.9}}
     with pytest.raises(InputError, match="expected an avatar of the settings of this run"):
         runner.run(replace(driven, out=f"{config.out}-3", settings=settings))

@@ -526,7 +526,7 @@ def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
         Plugin("mine", "other 1", ReportSpec("mine", "", "toy_plugin:report")),
     ]
     monkeypatch.setattr(runner, "discover", lambda group: {plugin.name: plugin for plugin in plugins})
-    assert runner.write_reports(tmp_path) == [tmp_path / "mine.txt"]
+    assert runner.write_reports(types.SimpleNamespace(folder=RunFolder(tmp_path))) == [tmp_path / "mine.txt"]
     assert (tmp_path / "mine.txt").read_text() == "mine"
     messages = [record.getMessage() for record in caplog.records]
     assert len(messages) == 2

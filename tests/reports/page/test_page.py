@@ -9,7 +9,9 @@ import pandas as pd
 import pytest
 
 from headbench.bench.contracts import FrameKey
+from headbench.bench.engine.captures import open_run_clips
 from headbench.bench.engine.config import RunOptions
+from headbench.bench.engine.store import FinishedRun, RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.rows import ALL, Rows
 from headbench.reports.page import frames, sections
@@ -374,8 +376,11 @@ def test_losses_are_means_of_subjects_with_equal_iterations(make_run, first, sec
 
 
 def test_a_run_writes_its_page_beside_the_tables(toy_run):
-    assert write_page(toy_run) == [toy_run / "report.html"]
-    assert Page(toy_run / "report.html").data["methods"] == ["toy", "failing"]
+    folder = RunFolder(toy_run)
+    clips = {clip.subject: clip for clip in open_run_clips(toy_run, RunOptions(trust=True))[1]}
+    run = FinishedRun(folder, folder.read_manifest(), Rows.read(folder.rows), clips)
+    assert write_page(run) == [folder.page]
+    assert Page(folder.page).data["methods"] == ["toy", "failing"]
 
 
 def test_a_card_has_the_citation_of_the_registered_method(page, write_run, change_manifest):
