@@ -239,10 +239,12 @@ def _configuration_of(run: Path, values: Mapping[str, Any], settings: RunSetting
     """Configuration of a run whose avatars are used. Raises `InputError` for code that it names and the ``values`` do not."""
     from .engine.captures import PROGRAMS, check_trusted, programs, run_configuration
 
+    used: Any = tuple(group for group in ("methods", "metrics") if group not in values)
     lists = [value.split(",") if isinstance(value, str) else value for value in values.values()]
     given = {name for names in lists if isinstance(names, (list, tuple)) for name in names}
-    config = run_configuration(run, RunOptions(data=settings.data, head=settings.head), given=given)
-    check_trusted(run, {PROGRAMS: programs(config.methods)}, given, trust=False)
+    config = run_configuration(run, RunOptions(data=settings.data, head=settings.head), used, given)
+    started = programs(config.methods) if "methods" in used else ()
+    check_trusted(run, {"metric_profiles": config.metric_profiles, PROGRAMS: started}, given, trust=False)
     return {**asdict(config), "source": str(run)}
 
 

@@ -55,7 +55,7 @@ def test_conditions_that_are_none_are_refused(values, match):
 
 
 def test_a_part_of_the_clip_out_of_range_fails_its_cell(config):
-    rows = runner.run(replace(config, conditions=(PLAIN, clip("hold-out", every=8))))
+    rows = runner.run(replace(config, conditions=(PLAIN, clip("hold-out", every=8)))).rows
     assert rows.failed == []
     with pytest.raises(InputError, match="every: expected a whole number from 2"):
         runner.run(replace(config, out=f"{config.out}-2", conditions=(clip("hold-out", every=0),)))

@@ -97,7 +97,9 @@ def test_a_module_that_a_run_names_is_not_imported(run, monkeypatch, tmp_path, c
         shown = "".join(capsys.readouterr())
         told = all(words in shown for words in (f"configuration.{key}", "--trust", "'stranger:SPEC'"))
         assert told == (key in needed), command
-    _, reason = open_truth(SimpleNamespace(runs=[SimpleNamespace(folder=RunFolder(run))]), RunOptions())
+    _, reason = open_truth(
+        SimpleNamespace(runs=[SimpleNamespace(folder=RunFolder(run), clips=None)]), RunOptions()
+    )
     assert ("'stranger:SPEC'" in reason) == (key == "reader")
     assert cli.main(["table", str(run)]) in (0, 2)
     assert "stranger" not in sys.modules

@@ -206,7 +206,7 @@ def test_a_failed_method_stands_with_its_error(toy_page):
 def test_without_the_capture_the_page_says_why(page, toy_run, tmp_path):
     (tmp_path / "data").rename(tmp_path / "gone")
     found = page()
-    assert "neither there" in found.data["reasons"][0]
+    assert "found nothing there" in found.data["reasons"][0]
     assert str(tmp_path) not in " ".join(found.texts.values())
     assert all(entry["p"][0] == -1 and entry["p"][1] >= 0 for entry in found.data["frames"])
     assert "no ground truth on this page" in " ".join(found.texts.values())

@@ -159,7 +159,7 @@ def test_what_is_not_trained_is_named(run, tmp_path):
         ({"methods": ("nobody",)}, "--methods.*mean-image, ga, gbs.*nobody"),
         ({"subjects": ("902",)}, "--subjects.*901.*902"),
         ({"avatars": ("nowhere",)}, "no such folder"),
-        ({"data": "nowhere"}, "no such folder"),
+        ({"data": "nowhere"}, "found nothing there"),
         ({"source": "nowhere"}, "no such folder"),
     ],
 )
