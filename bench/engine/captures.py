@@ -101,14 +101,13 @@ def reader_of(root: str) -> str:
 
     Raises `InputError` if several other readers find one.
     """
-    there = Path(root).exists()
-    found = [name for name, spec in readers().items() if there and finds(spec, Path(root))]
-    if "ga" in found or not found:
+    if not Path(root).exists() or finds(get("datasets", "ga"), Path(root)):
         return "ga"
+    found = [name for name, spec in readers().items() if finds(spec, Path(root))]
     if len(found) > 1:
         expected = "a capture that one reader knows"
         raise InputError(root, "", expected, f"one for {', '.join(found)}", "Choose with the setting reader.")
-    return found[0]
+    return found[0] if found else "ga"
 
 
 def capture_configuration(

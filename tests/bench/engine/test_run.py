@@ -340,7 +340,7 @@ def test_a_damaged_record_is_refused_and_named(config, kept, refuses, name):
     refuses(config, match)
 
 
-def test_a_cell_without_its_record_or_of_other_inputs_is_not_overwritten(config, kept, cell, refuses):
+def test_a_cell_of_other_inputs_or_none_is_not_overwritten(config, kept, cell, refuses):
     kept(config)
     cell.update(fingerprint="other")
     refuses(config, "cell.json, fingerprint: expected the data.* Choose another --out, or delete ")
