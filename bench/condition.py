@@ -84,6 +84,8 @@ class Condition:
         without one, that of the plain comparison in the same run.
     drive : Named
         Poses and views to render instead of the scored frames, evaluated without ground truth.
+    views : Named
+        Change of the camera and pose that each scored frame is rendered with by the avatar, which is that of ``derive``.
     """
 
     name: str = ""
@@ -94,6 +96,7 @@ class Condition:
     clip: Named = field(default_factory=Named)
     derive: Named = field(default_factory=Named)
     drive: Named = field(default_factory=Named)
+    views: Named = field(default_factory=Named)
 
     def __post_init__(self) -> None:
         """Refuse a budget that is neither a fraction nor a time."""
@@ -109,6 +112,11 @@ class Condition:
     def changes_budget(self) -> bool:
         """Whether methods train with a budget other than the run's."""
         return seconds_of_text(self.budget) is not None or self.part != 1
+
+    @property
+    def follows(self) -> bool:
+        """Whether it uses the avatar of the plain comparison instead of training one."""
+        return bool(self.derive or self.views)
 
     @property
     def changes_settings_alone(self) -> bool:

@@ -277,7 +277,7 @@ class Variant(NamedTuple):
 
 
 STAGES = ("drive", "deform", "rasterize", "post")
-"""Stages of a frame, in order: driving signal to mesh and features; mesh to primitives as the camera sees them;
+"""Stages of a frame, in order: driving signal to posed head model; that to primitives as the camera sees them;
 primitives to image; whatever changes the image afterwards (a decoder, clipping)."""
 
 
@@ -374,6 +374,24 @@ class ListedFrames(Avatar, Protocol):
         ``alpha`` is 1 if the program does not output coverage. Raises `HeadbenchError` with the last lines of the
         program's output if it fails or leaves a frame out.
         """
+
+
+class Changes(NamedTuple):
+    """What the mechanism of a method (`MethodSpec.mechanism`) makes of N splats, or other primitives, in one pose."""
+
+    values: Mapping[str, FloatArray]
+    """(N,) or (N, C) by quantity: "opacity" and "color" in [0, 1], "position" in millimetres. Constant parts, and motion that
+    the head model determines, do not matter; empty without the mechanism."""
+    penalised: BoolArray | None = None
+    """(N,) splats whose changes the training penalises in this pose; None for a method without such a penalty."""
+
+
+@runtime_checkable
+class ChangingAvatar(Avatar, Protocol):
+    """An avatar that shows the effect of its method's mechanism. Optional."""
+
+    def changes(self, pose: HeadPose) -> Changes:
+        """Values of the same primitives, in the same order, in every pose."""
 
 
 class Progress(Protocol):

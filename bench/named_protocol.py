@@ -73,6 +73,8 @@ class NamedProtocol:
         Training iterations of the paper's own method.
     tracker, head_model : str
         Tracker and head model of the driving signal.
+    test_refit : bool | None
+        Whether scored frames are fitted to their own pictures first, as under the condition test-refit; None if unknown.
     """
 
     title: str
@@ -89,6 +91,7 @@ class NamedProtocol:
     iterations: int | None = None
     tracker: str = ""
     head_model: str = ""
+    test_refit: bool | None = None
 
     def __post_init__(self) -> None:
         """Refuse unknown tasks, none, and batches of less than one frame."""

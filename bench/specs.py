@@ -93,6 +93,38 @@ class ResolutionRule:
 
 
 @dataclass(frozen=True)
+class Mechanism:
+    """The learnt part of a method that its paper proposes, and that its avatars should show.
+
+    Attributes
+    ----------
+    name : str
+        What it is called.
+    meaning : str
+        The quantities of `ChangingAvatar.changes` that it changes, and of what.
+    ablation : str
+        The one of `MethodSpec.ablations` that turns it off.
+    """
+
+    name: str
+    meaning: str
+    ablation: str
+
+    def told(self, dynamic: float, condition: str = "") -> str:
+        """Its name, whether it is off or left out by the condition, and its meaning; ``dynamic`` is a value of `DYNAMIC`."""
+        state = OFF if dynamic < ACTING else ""
+        return f"{self.name}{' left out' if condition.startswith(self.ablation) else state}: {self.meaning}"
+
+
+DYNAMIC = "dynamic_splats"
+"""The metric that measures mechanisms."""
+ACTING = 5.0
+"""Percentage of dynamic splats below which a mechanism is off."""
+OFF = " off"
+"""What follows the name of such a mechanism."""
+
+
+@dataclass(frozen=True)
 class MethodSpec:
     """Description of a method. Loading it imports neither torch nor the implementation.
 
@@ -137,6 +169,8 @@ class MethodSpec:
         ``headbench run sweep``: variants of a trained avatar that need no training; "" for none.
     ablations : Mapping[str, Mapping[str, Any]]
         Settings by name that leave out or change one part of the method, for ``headbench run suite --ablations``.
+    mechanism : Mechanism | None
+        What the metric `DYNAMIC` measures; None for a method whose avatars do not show it (`ChangingAvatar`).
     devices : tuple[str, ...]
         Supported kinds of devices, such as "cpu"; empty means any. A run on another device is
         refused.
@@ -168,6 +202,7 @@ class MethodSpec:
     demo: bool = False
     variants: str = ""
     ablations: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    mechanism: Mechanism | None = None
     renders: str = ""
     devices: tuple[str, ...] = ()
     needs: str = ""
@@ -192,7 +227,7 @@ MAX_DIGITS = 12
 """Decimals shown in tables."""
 
 
-MetricKind = Literal["frame", "regional", "temporal", "sequence", "avatar", "training"]
+MetricKind = Literal["frame", "regional", "temporal", "sequence", "avatar", "mechanism", "training"]
 
 
 @dataclass(frozen=True)
@@ -206,7 +241,7 @@ class MetricSpec:
     kind : MetricKind
         "frame", a `Metric`; "regional", a `RegionalMetric`; "temporal", a `TemporalMetric`; "sequence", a
         `SequenceMetric`, whose value is assigned to each of the frames; "avatar",
-        an `AvatarMetric`; "training", a `TrainingMetric`.
+        an `AvatarMetric`; "mechanism", one whose workload is the poses of training; "training", a `TrainingMetric`.
     detail : str
         Key of the measurement's details that holds the value, in ``unit``; "" for the main value.
         Metrics of an avatar with the same implementation are measured once, together.
@@ -334,6 +369,8 @@ class ConditionSpec:
         "derive": a function ``(method spec, avatar folder, folder to write, clip, device, **parameters) -> Avatar``.
         "drive": a function ``(job, avatar, progress, **parameters) -> (Rows, details)`` that writes below the run folder.
         Details are JSON values.
+        "views": a function ``(avatar, clip, key, background, **parameters) -> (camera, pose)`` of a scored frame, whose
+        picture it can read; the values are not comparable with those of tracked views.
     implementation : str
         "package.module:function".
     protocols : str
@@ -345,7 +382,7 @@ class ConditionSpec:
 
     name: str
     summary: str
-    kind: Literal["clip", "derive", "drive"]
+    kind: Literal["clip", "derive", "drive", "views"]
     implementation: str
     protocols: str = ""
     metrics: tuple[MetricSpec, ...] = ()

@@ -118,6 +118,13 @@ RIGID_HEAD = ConditionSpec(
     implementation="headbench.datasets.steps.rigid:as_rigid_head",
 )
 
+REST_EXPRESSION = ConditionSpec(
+    name="rest-expression",
+    summary="Clip: expressions that are not zero at rest, with unchanged meshes; parameters millimetres, seed.",
+    kind="clip",
+    implementation="headbench.datasets.steps.rest:with_rest_expression",
+)
+
 PACKED_CHART = ConditionSpec(
     name="packed-chart",
     summary="Clip: texture coordinates for a head model without any, with a separate area for every triangle.",

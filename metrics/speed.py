@@ -76,8 +76,8 @@ def _stage(name: str, label: str, what: str) -> MetricSpec:
     return _milliseconds(f"stage_{name}", label, f"{name}_ms", f"Median time {what}.")
 
 
-STAGE_DRIVE = _stage("drive", "Drive", "from driving signal to mesh and features")
-STAGE_DEFORM = _stage("deform", "Deform", "from mesh to primitives as the camera sees them")
+STAGE_DRIVE = _stage("drive", "Drive", "from driving signal to posed head model")
+STAGE_DEFORM = _stage("deform", "Deform", "from there to primitives as the camera sees them")
 STAGE_RASTERIZE = _stage("rasterize", "Rasterize", "from primitives to image")
 STAGE_POST = _stage("post", "Post", "of the post-processing of the image")
 STAGE_READ_BACK = _stage("read_back", "Read-back", "to bring the image into host memory")
@@ -103,7 +103,7 @@ FPS_WITHOUT_HEAD = replace(
     name="fps_without_head",
     label="1 thread, without head model",
     detail="without_head_fps",
-    summary="Frames per second on one thread, from the posed mesh: without the stage from driving signal to mesh and features.",
+    summary="Frames per second on one thread, from the posed mesh: without the stage from driving signal to posed head model.",
 )
 
 WHITE = (1.0, 1.0, 1.0)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import pandas as pd
 
 from ..bench.rows import ALL, SUSPECT, Rows
-from ..bench.specs import MetricSpec
-from .aggregate import whole_images
+from ..bench.specs import ACTING, DYNAMIC, OFF, MetricSpec
+from .aggregate import summarise, whole_images
 
 OTHERS_LIMIT = 0.1
 """Times are marked if other processes used more than this number of cores in total.
@@ -108,6 +108,23 @@ def suspects(rows: Rows, methods: Sequence[str]) -> dict[tuple[str, str, str], s
                 f"Suspect, not ranked: {len(found)} frames are {why}, which a method that has not seen them cannot reach."
             )
     return notes
+
+
+def mechanisms(rows: Rows, methods: Sequence[str]) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Note on the mechanism of each method by label, and a sentence on each one that is off, see `Mechanism`."""
+    notes, off = {}, []
+    for method in methods:
+        value = summarise(rows, method, DYNAMIC, "").value
+        own = rows.select(method=method, metric=DYNAMIC, task="", region=ALL, seeds=ALL)
+        reasons = list(filter(None, map(str, own["reason"])))
+        name, _, meaning = "".join(reasons[:1]).partition(": ")
+        if value is None or not meaning:
+            continue
+        name = name.removesuffix(OFF)
+        notes[method] = f"{name}: {meaning}."
+        if value < ACTING and any(f"{OFF}: " in reason for reason in reasons):
+            off.append(f"{method}: {name}{OFF}: {value:.1f} % of the splats change ({meaning}).")
+    return notes, tuple(off)
 
 
 def note_of(by_method: Mapping[str, Conditions]) -> str:

@@ -132,6 +132,11 @@ def differences(runs: RunSet, protocol: NamedProtocol) -> list[str]:
     if protocol.iterations is not None and budgets and budgets != [protocol.iterations]:
         most = f"{budgets[0]:,}" + (f" to {budgets[-1]:,}" if len(budgets) > 1 else "")
         found.append(f"Iterations: {most}; in the protocol: {protocol.iterations:,}.")
+    tracked = [label for label in runs.methods if label not in runs.with_refit]
+    if protocol.test_refit and tracked:
+        found.append(
+            "Scored frames: as tracked; in the protocol: fitted to their own pictures (condition test-refit)."
+        )
     return found
 
 

@@ -338,6 +338,21 @@ class RunSet:
         return (said,) if any(run.manifest.unchecked for run in self.runs) else ()
 
     @property
+    def with_refit(self) -> tuple[str, ...]:
+        """Labels under conditions that score frames from other views than those of the capture's tracking."""
+        changed = {c.name for run in self.runs for c in run.manifest.configuration.conditions if c.views}
+        return tuple(label for label, record in self.records.items() if record.condition in changed)
+
+    @property
+    def refitted(self) -> tuple[str, ...]:
+        """A sentence on `with_refit`."""
+        labels = self.with_refit
+        said = (
+            "each scored frame was fitted to its own picture (camera, jaw, expression) with the avatar frozen"
+        )
+        return (f"{', '.join(labels)}: {said}; not comparable with values of tracked frames.",) * bool(labels)
+
+    @property
     def missing(self) -> tuple[str, ...]:
         """A sentence for each requested task that no run could measure."""
         done = {task for run in self.runs for task in run.tasks}

@@ -237,7 +237,12 @@ def table_of(
         cut=runs.cut,
         machine=runs.machine,
         part=runs.part if tasks else "",
-        missing=(*(runs.missing if tasks == runs.tasks else ()), *runs.mixed_code, *runs.unchecked),
+        missing=(
+            *(runs.missing if tasks == runs.tasks else ()),
+            *runs.mixed_code,
+            *runs.unchecked,
+            *runs.refitted,
+        ),
         cameras=runs.cameras if {SPLIT_TASK, SEEN_CAMERAS, UNSEEN_CAMERAS} & {*tasks} else "",
         keys=runs.keys,
         averaged=runs.averaged,

@@ -10,15 +10,16 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from ..bench.condition import CONDITION_MARK
 from ..bench.contracts import FrameKey
 from ..bench.engine.scoring import FULL
 from ..bench.progress import counted
 from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, Rows
-from ..bench.specs import MetricSpec
+from ..bench.specs import DYNAMIC, MetricSpec
 from .aggregate import Aggregate, subject_means, summarise, whole_images
 from .coded import CODED_CHANGE
-from .conditions import conditions, marks, measured_on, suspects
+from .conditions import conditions, marks, measured_on, mechanisms, suspects
 from .statistics.comparisons import BestSet, best_set
 from .statistics.paired import LEVEL
 
@@ -97,7 +98,7 @@ AVERAGED = "frames, then sequences, then subjects"
 class Table:
     """A comparison that can be written in any format.
 
-    ``warnings`` name methods that are not better than a trivial baseline; ``marking`` explains the ranks and their test (``tested``: whether there is one), ``starred`` those of text, which marks
+    ``warnings`` name methods that are not better than a trivial baseline, or whose mechanism is off; ``marking`` explains the ranks and their test (``tested``: whether there is one), ``starred`` those of text, which marks
     only the best; ``part`` describes the part of the
     frames, "" for all; ``missing`` explains why a task has no columns; ``name`` is the layout; ``cameras`` describes seen and
     unseen cameras, or why they are not shown separately; ``printed`` is the source of published values, with their conditions
@@ -204,7 +205,7 @@ class Table:
 
 
 AVATAR_TITLE = "Avatar"
-TITLES = {"speed": "Speed", "cost": "Storage and training"}
+TITLES = {"speed": "Speed", "cost": "Storage and training", "mechanism": "Mechanisms"}
 """Titles of layouts whose columns belong to no task."""
 METHODS_TITLE = "Methods"
 TRIVIAL_TITLE = "Trivial baselines (not ranked)"
@@ -282,7 +283,9 @@ def build_table(
         for m, task, title in places
     )
     found = conditions(rows, metrics, methods)
+    told, off = mechanisms(rows, methods)
     marked = marks(found, trivial)
+    mechanical = {spec.name for spec in metrics if spec.kind == "mechanism"}
     suspect = suspects(rows, methods)
     too_good = {method for _, method, _ in suspect}
     titles = dict.fromkeys(methods, METHODS_TITLE)
@@ -300,10 +303,11 @@ def build_table(
         for c in columns:
             cell = summarise(rows, method, c.metric, c.task)
             mark = suspect.get((c.metric, method, c.task)) or marked.get((c.metric, method), "")
+            mark = told.get(method, "") if c.metric == DYNAMIC else mark
             cells.append(_cell(cell, c.digits, notes, mark))
         lines.append(TableRow(method, ", ".join(rows.versions(method)), method in unranked, tuple(cells)))
-    # Times measured under different conditions are not ranked.
-    unequal = {metric for metric, method in marked if method not in unranked}
+    # Times measured under different conditions are not ranked, and mechanisms are different quantities.
+    unequal = {metric for metric, method in marked if method not in unranked} | mechanical
     bests = [
         None if column.metric in unequal else _best(rows, lines, index, column)
         for index, column in enumerate(columns)
@@ -323,7 +327,7 @@ def build_table(
             for task in tasks
         ),
         seeds=max(1, len(rows.seeds(ALL))),
-        warnings=(*below.values(), BELOW_CAUSES) if below else (),
+        warnings=(*((*below.values(), BELOW_CAUSES) if below else ()), *off),
         marking=marking,
         starred=starred,
         image_size=image_size,
@@ -347,12 +351,15 @@ def not_better(
 ) -> dict[str, str]:
     """Sentences by method on those that are not better than a trivial baseline in some task."""
     found: dict[str, str] = {}
+    plain = [
+        name for name in trivial if CONDITION_MARK not in name
+    ] or trivial  # conditions change the task, too
     of_frames = sorted((spec for spec in metrics if spec.per_frame), key=lambda spec: spec.name != DECIDING)
     for spec in of_frames[:1]:
         sign = 1 if spec.higher_is_better else -1
         for task in tasks:
             values = {name: summarise(rows, name, spec.name, task).value for name in (*methods, *trivial)}
-            floors = {name: sign * value for name in trivial if (value := values[name]) is not None}
+            floors = {name: sign * value for name in plain if (value := values[name]) is not None}
             best = max(floors, key=floors.__getitem__, default="")
             for name in methods:
                 value = values[name]

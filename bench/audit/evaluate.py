@@ -156,7 +156,9 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     stored = open_avatar(source, settings.method) if settings.avatar else None
     label = settings.label or ("images" if stored is None else stored.record["method"])
     config, clips = _open(settings, label, {} if stored is None else stored.heads)
-    metrics = [m for m in resolve_metrics(config) if m.per_frame or (settings.avatar and m.kind == "avatar")]
+    metrics = [
+        m for m in resolve_metrics(config) if m.per_frame or (settings.avatar and m.kind != "training")
+    ]
     if not metrics:
         raise InputError("metrics", "", "at least one metric of frames", ", ".join(config.metrics))
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
@@ -170,7 +172,9 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
         stored.check_subject(clips[0])
         avatar, of = stored.load(config.device), stored.method
         method = images_method(config.methods[0], avatar_digest(source)[:12])
-        needs = {name: getattr(of.spec, name) for name in ("head_models", "monocular", "resolution")}
+        needs = {
+            name: getattr(of.spec, name) for name in ("head_models", "monocular", "resolution", "mechanism")
+        }
         method = replace(method, spec=replace(method.spec, **needs))
     else:
         images = find_images(source, clips, protocols, settings.names, config)

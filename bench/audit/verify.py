@@ -148,7 +148,7 @@ def _verify_cell(
     avatar = job.load() if stored else NoAvatar()
     again = []
     for metric in metrics:
-        if metric.per_frame or (stored and metric.kind == "avatar" and not metric.machine_bound):
+        if metric.per_frame or (stored and metric.kind != "training" and not metric.machine_bound):
             again.append(metric)
         else:
             found.unverified[metric.name] = "of the training, the machine or an avatar that is not stored"

@@ -209,7 +209,7 @@ def programs(names: Iterable[str]) -> list[str]:
 
 def _names_of(config: RunConfig) -> dict[str, tuple[str, ...]]:
     """Names of plug-ins in a configuration by key, for `check_trusted`."""
-    changes = [change.name for c in config.conditions for change in (c.clip, c.derive, c.drive)]
+    changes = [change.name for c in config.conditions for change in (c.clip, c.derive, c.drive, c.views)]
     return {
         "reader": (config.reader,),
         "conditions": (*changes, config.clip.name),

@@ -16,6 +16,7 @@ from typing import Any
 from ..contracts import (
     Avatar,
     Camera,
+    Clip,
     CodedAvatar,
     Frame,
     FrameKey,
@@ -32,7 +33,7 @@ from ..machine import PeakMemory, ProcessorLoad, machine_name, processor_seconds
 from ..progress import duration
 from ..protocol import Protocol
 from ..rows import SUSPECT, Row, Rows
-from ..specs import MetricSpec
+from ..specs import DYNAMIC, MetricSpec
 from .adaptation import AdaptedClip
 from .config import resolve_change
 from .guard import TrainingView, check_frame
@@ -183,12 +184,15 @@ def _drawn(
     job: Job, avatar: Avatar, missing: Mapping[Path, tuple[Protocol, FrameKey]], report: Progress
 ) -> Iterator[tuple[Path, Frame]]:
     """Path and frame of each render; for avatars that render lists, a whole task at a time."""
-    clip = job.form.clip
+    clip, change = job.form.clip, resolve_change(job.condition.views, "views")
     views: dict[str, dict[FrameKey, tuple[Path, tuple[Camera, HeadPose], Sequence[float]]]] = {}
     for path, (protocol, key) in missing.items():
         seen = job.form.key(key)
         view = clip.cameras[seen.camera], clip.poses[seen.timestep]
-        if isinstance(avatar, ListedFrames):
+        if job.condition.views:
+            camera, pose = change(avatar, clip, seen, protocol.background)
+            yield path, avatar.render(camera, pose, protocol.background)
+        elif isinstance(avatar, ListedFrames):
             views.setdefault(protocol.task, {})[seen] = (path, view, protocol.background)
         else:
             yield path, avatar.render(*view, protocol.background)
@@ -278,6 +282,19 @@ def workload(
     return pairs[:-1] if len(pairs) > 2 and first[0] is last[0] and first[1] is last[1] else pairs
 
 
+MOST_POSES = 200
+"""Timesteps of training over which a mechanism is measured; more are thinned evenly."""
+
+
+def training_poses(clip: Clip) -> list[tuple[Camera, HeadPose]]:
+    """The timesteps of the training split in order, each with its first camera, at most `MOST_POSES`."""
+    cameras = {key.timestep: key.camera for key in sorted(clip.splits["train"], reverse=True)}
+    timesteps = sorted(cameras)
+    count = min(len(timesteps), MOST_POSES)
+    chosen = (timesteps[i * len(timesteps) // count] for i in range(count))
+    return [(clip.cameras[cameras[timestep]], clip.poses[timestep]) for timestep in chosen]
+
+
 def _score(job: Job, specs: Sequence[MetricSpec], protocol: Protocol) -> Iterator[Row]:
     """Rows of each metric over a protocol's frames of the job's subject."""
     keys = [key for key in protocol.keys if key.subject == job.clip.subject]
@@ -303,6 +320,8 @@ def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement |
         if spec.kind == "training":
             record = job.cell.record
             return metric({**record.get("training", {}), "method": record.get("method", {})})  # type: ignore[no-any-return]
+        if spec.kind == "mechanism":
+            return metric(avatar, training_poses(job.form.clip))  # type: ignore[no-any-return]
         pairs = workload(job.form, job.protocols, job.method.spec.resolution.speed_size)
         if not spec.machine_bound:
             return metric(avatar, pairs)  # type: ignore[no-any-return]
@@ -319,7 +338,10 @@ def _avatar_row(job: Job, spec: MetricSpec, outcome: Measurement | UnavailableEr
     if spec.detail and spec.detail not in outcome.details:
         return _row(job, spec, reason="The avatar does not report it.")
     value = float(outcome.details[spec.detail]) if spec.detail else outcome.value
-    return replace(_row(job, spec, value=value, status="ok"), **_conditions(job, spec, outcome.details))
+    mechanism = job.method.spec.mechanism if spec.name == DYNAMIC else None
+    reason = mechanism.told(value, job.condition.name) if mechanism else ""
+    row = _row(job, spec, value=value, status="ok", reason=reason)
+    return replace(row, **_conditions(job, spec, outcome.details))
 
 
 def _conditions(job: Job, spec: MetricSpec, details: Mapping[str, float]) -> dict[str, Any]:

@@ -113,13 +113,15 @@ class RunConfig:
             changed = replace(condition, methods=(), drive=Named()) != PLAIN
             if changed and not condition.name:
                 raise ValueError("conditions: a name for each one that changes something; found none")
-            if condition.derive and not self.source and PLAIN not in self.conditions:
+            if condition.follows and not self.source and PLAIN not in self.conditions:
                 expected = "the plain comparison beside it, or a source that names their run"
-                raise ValueError(f"conditions: {condition.name} derives avatars; {expected}")
+                raise ValueError(f"conditions: {condition.name} uses trained avatars; {expected}")
             trains = condition.settings or condition.clip or condition.changes_budget
-            if trains and condition.derive:
-                expected = "nothing is trained for a derived avatar; derive alone"
+            if trains and condition.follows:
+                expected = "nothing is trained for derive and views; derive or views alone"
                 raise ValueError(f"conditions, {condition.name}: {expected}")
+            if condition.drive and condition.views:
+                raise ValueError(f"conditions, {condition.name}: drive or views; found both")
         if len({condition.drive.name for condition in self.conditions}) > 1:
             raise ValueError(
                 "conditions: all are driven by one registered change, or none is; found a mixture"
@@ -299,7 +301,7 @@ def _unconverted(spec: MethodSpec, condition: str) -> MethodSpec:
     return replace(spec, head_models=(), monocular=False)
 
 
-KINDS = ("clip", "derive", "drive")
+KINDS = ("clip", "derive", "drive", "views")
 
 
 def resolve_change(change: Named, kind: str) -> Callable[..., Any]:

@@ -121,7 +121,7 @@ class Job:
     def fit_fingerprint(self) -> str:
         """Digest of everything the trained avatar depends on."""
         made_of = {**self.method.identity(), "name": self.label}
-        derived = [asdict(self.condition.derive)] if self.condition.derive else []
+        derived = [asdict(change) for change in (self.condition.derive, self.condition.views) if change]
         return digest(RESULT_FORMAT, made_of, self.seed, self.device, self.form.clip.fingerprint, *derived)
 
     @property
@@ -374,8 +374,8 @@ def make_jobs(
 
     def source_of(clip: Clip, method: ResolvedMethod, condition: Condition, seed: int) -> Cell | None:
         """The cell whose avatar is used; None for a training. What is derived or driven is the plain avatar."""
-        origin = source or (folder if condition.derive else None)
-        plain = condition.derive or condition.drive
+        origin = source or (folder if condition.follows else None)
+        plain = condition.follows or condition.drive
         label = label_of(method.spec.name, "" if plain else condition.name)
         return None if origin is None else origin.cell(clip.subject, label, seed)
 

@@ -87,6 +87,13 @@ VARIANT = ConditionSpec(
     implementation="headbench.bench.experiments.sweep:variant",
 )
 
+TEST_REFIT = ConditionSpec(
+    name="test-refit",
+    summary="Views: fits expression, jaw and camera of each scored frame to its own picture, with the avatar frozen.",
+    kind="views",
+    implementation="headbench.bench.experiments.refit:refit",
+)
+
 MEASURES = (
     MetricSpec("non_finite", "Not finite", "share", False, 3, ""),
     MetricSpec("coverage", "Coverage", "ratio", True, 3, ""),

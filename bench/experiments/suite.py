@@ -142,7 +142,8 @@ def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
         found.append(Condition(EQUAL, names, {"budget": {"iterations": count}}))
     found = [condition for condition in found if condition.methods]
     estimated = [condition for condition in found if condition.clip and OURS in condition.methods]
-    crossed = _ablations("--tracked-ablations", settings.tracked_ablations, specs)
+    ours = {name: spec for name, spec in specs.items() if name == OURS}
+    crossed = _ablations("--tracked-ablations", settings.tracked_ablations, ours)
     if crossed and not estimated:
         expected = f"{OURS} among those of --tracked, which --tracked-ablations are compared with"
         raise InputError("command line", "--tracked", expected, " ".join(tracked) or NONE)
@@ -157,18 +158,19 @@ def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
 
 
 def _ablations(option: str, asked: Sequence[str], specs: dict[str, MethodSpec]) -> list[Condition]:
-    """The requested ablations in the order of the method's spec. Raises `InputError` for unknown ones or a missing method."""
-    if not asked:
-        return []
-    if OURS not in specs:
-        expected = f"{OURS} among them, which {option} are compared with"
+    """The requested ablations in the order of the methods' specs; the one of ours if several methods have the name.
+
+    Raises `InputError` for unknown ones, and for `ALL` without ours.
+    """
+    if ALL in asked and OURS not in specs:
+        expected = f"{OURS} among them, whose {option} are all"
         raise InputError("command line", "--methods", expected, ", ".join(specs))
-    known = specs[OURS].ablations
-    unknown = [name for name in asked if name not in (*known, ALL)]
-    if unknown:
-        raise InputError("command line", option, f"{', '.join(known)} or {ALL}", unknown[0])
+    known: dict[str, Condition] = {}
+    for spec in sorted(specs.values(), key=lambda spec: spec.name == OURS):
+        known |= {name: Condition(name, (spec.name,), dict(own)) for name, own in spec.ablations.items()}
+    for name in asked:
+        if name not in (*known, ALL):
+            raise InputError("command line", option, f"{', '.join(known)} or {ALL}", name)
     return [
-        Condition(name, (OURS,), dict(changed))
-        for name, changed in known.items()
-        if name in asked or ALL in asked
+        each for name, each in known.items() if name in asked or (ALL in asked and each.methods == (OURS,))
     ]

@@ -49,8 +49,8 @@ class SuiteSettings(ExecutionOptions):
     """Seeds of the training."""
 
     ablations: tuple[str, ...] = ()
-    """Train ours with these parts left out or changed, too, each as a condition of the run (`headbench list methods --json` has their
-    settings); or "all"."""
+    """Train a method with these parts left out or changed, too, each as a condition of the run (`headbench list methods --json` has
+    their names and settings); or "all" those of ours."""
 
     tracked: tuple[str, ...] = ()
     """Methods trained a second time, on tracking estimated from the images as by `headbench track`, as condition `tracked` of

@@ -96,6 +96,9 @@ def jaw_bases(
 def jaw_weights(quaternions: FloatArray, bases: FloatArray) -> FloatArray:
     """(N, n) weights of jaw rotations on the bases: |<q, q_i>| / sum_j |<q, q_j>|; rows sum to 1.
 
+    They hardly depend on the pose: the cosine of half an angle a is 1 - a^2 / 8, so for angles up to 0.2 rad from the bases all
+    weights lie within 0.5 % of 1 / n.
+
     Parameters
     ----------
     quaternions : FloatArray

@@ -583,6 +583,7 @@ KINDS = {
     "regional": "measured for each frame and region",
     "temporal": "measured for each frame and its predecessor",
     "sequence": "measured for all frames of a sequence at a camera together",
+    "mechanism": "measured for each avatar over the poses of its training",
 }
 
 
@@ -601,6 +602,7 @@ def conditions_page() -> str:
             "clip": "changes the clip",
             "derive": "changes a trained avatar",
             "drive": "drives avatars otherwise",
+            "views": "changes the views of scored frames",
         }
         text = f"{escaped(spec.summary)} ({kind[spec.kind]})\n\n{about}\n"
         rows = [

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
-from ...bench.contracts import Clip, FloatArray, HeadPose
+from ...bench.contracts import Changes, Clip, FloatArray, HeadPose
 from ..avatars.compact.layouts import offsets, read_coded
 from ..avatars.harmonics import turn_harmonics
 from ..ops.harmonics import coefficient_count, turned_colors
@@ -23,7 +23,7 @@ from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
 from ..ops.planes import encode
 from ..shared.networks import initial_network, layer_names, tracked_inputs
-from ..shared.rendering import PlacedSplats, rasterize_view
+from ..shared.rendering import PlacedSplats, changes_of, rasterize_view
 from ..shared.schedule import ShuffledEpochs
 from ..shared.splat_training import initial_shapes
 from ..shared.subject_mesh import BoundedCache, mouth_mask
@@ -125,10 +125,19 @@ class FlashAvatarAvatar(SurfaceAvatar[TrainedSplats]):
         rotation = self.surface.posed(self.mesh.arguments([pose])).rotation
         return turn_harmonics(self.stored.tensors["sh_dc"], self.stored.tensors["sh_rest"], rotation)
 
-    def _placed(self, frames: TriangleFrames, arguments: Mapping[str, Tensor]) -> PlacedSplats:
+    @torch.no_grad()
+    def changes(self, pose: HeadPose) -> Changes:
+        """Offsets of the splats from the mesh."""
+        return changes_of({"position": 1000 * self._changed(self.mesh.arguments([pose]))["means"]})
+
+    def _changed(self, arguments: Mapping[str, Tensor]) -> dict[str, Tensor]:
         tensors, config = self.stored.tensors, self.stored.settings
         outputs = network_outputs(tensors, self._of_points, tracked_inputs(arguments, INPUTS)[0], config)
-        world = self.surface.place(frames, changed(tensors, outputs, config))
+        return changed(tensors, outputs, config)
+
+    def _placed(self, frames: TriangleFrames, arguments: Mapping[str, Tensor]) -> PlacedSplats:
+        tensors, config = self.stored.tensors, self.stored.settings
+        world = self.surface.place(frames, self._changed(arguments))
         harmonics = tensors["sh_dc"], tensors["sh_rest"], world.means, frames.rotation
         colors = partial(turned_colors, *harmonics, degree=config.sh_degree)
         return PlacedSplats(world, tensors["opacities"].sigmoid(), colors)

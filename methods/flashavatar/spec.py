@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...bench.specs import MethodSpec
+from ...bench.specs import Mechanism, MethodSpec
 
 SHORT: dict[str, Any] = {
     "initial_opacity": 0.5,
@@ -39,6 +39,8 @@ FLASHAVATAR = MethodSpec(
     config="headbench.methods.flashavatar.config:FlashAvatarConfig",
     variants="headbench.methods.avatars.derived.recipes:flashavatar_variants",
     needs="headbench.methods.shared.needs:splats",
+    ablations={"no-offsets": {"zero_output": True, "network_lr": 0.0}},
+    mechanism=Mechanism("offset network", "offsets of the splats from the mesh", "no-offsets"),
     presets=PRESETS,
     source="FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Embedding, CVPR 2024, arXiv 2312.02214",
     bibtex=r"""@inproceedings{xiang2024flashavatar,

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Clip, FloatArray, HeadPose
+from ...bench.contracts import Changes, Clip, FloatArray, HeadPose
 from ..avatars.compact.layouts import bound, read_coded
 from ..ops.harmonics import (
     coefficient_count,
@@ -23,7 +23,7 @@ from ..ops.harmonics import (
     occupied_degree,
 )
 from ..ops.mesh import TriangleFrames
-from ..ops.splats import activate, to_world
+from ..ops.splats import WorldSplats, activate, to_world
 from ..shared.avatar_files import (
     COMPACT_FILE,
     SUBJECT_FILE,
@@ -39,7 +39,7 @@ from ..shared.capacity import CapacityPlan, CapacityPlanner
 from ..shared.loop import Fit
 from ..shared.method import TrainedMethod
 from ..shared.optimisation import Optimiser
-from ..shared.rendering import USUAL, Cutoffs, PlacedSplats, StoredSplatAvatar, View
+from ..shared.rendering import USUAL, Cutoffs, PlacedSplats, StoredSplatAvatar, View, changes_of
 from ..shared.schedule import ShuffledEpochs, Timeline, torch_generator
 from ..shared.splat_training import BoundTraining, ShadedSplats
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, TrainingPoses
@@ -172,14 +172,24 @@ class GAAvatar(StoredSplatAvatar):
         """Colours; see `HarmonicAvatar`. The pose does not change them."""
         return self.splat_tensors["sh_dc"].cpu().numpy(), self.splat_tensors["sh_rest"].cpu().numpy()
 
+    @torch.no_grad()
+    def changes(self, pose: HeadPose) -> Changes:
+        """Displacement of the splats by the refined tracking; zero in a pose that was not refined."""
+        if self.refined is None:
+            return Changes({})
+        tracked, refined = (self._world(self.mesh.drive(each)).means for each in (pose, self.refined(pose)))
+        return changes_of({"position": 1000 * (refined - tracked)})
+
     def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
         if self.refined is not None:
             pose = self.refined(pose)
         frames = self.mesh.drive(pose)
         end_stage("drive")
-        splats = self.splat_tensors
-        world = to_world(frames, self.binding, splats["means"], *self._shape, self._activated)
-        return PlacedSplats(world, torch.sigmoid(splats["opacities"]), partial(self._shade, world.means))
+        world, opacities = self._world(frames), self.splat_tensors["opacities"]
+        return PlacedSplats(world, torch.sigmoid(opacities), partial(self._shade, world.means))
+
+    def _world(self, frames: TriangleFrames) -> WorldSplats:
+        return to_world(frames, self.binding, self.splat_tensors["means"], *self._shape, self._activated)
 
 
 class GA(TrainedMethod[GAConfig, GAAvatar]):

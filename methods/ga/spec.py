@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...bench.specs import MethodSpec
+from ...bench.specs import Mechanism, MethodSpec
 from ..shared.config import splat_presets
 
 SHORT: dict[str, Any] = {"sh_dc_lr": 0.02, "sh_rest_lr": 1e-3}
@@ -20,6 +20,8 @@ GA = MethodSpec(
     config="headbench.methods.ga.config:GAConfig",
     needs="headbench.methods.shared.needs:splats",
     variants="headbench.methods.avatars.derived.ga_variants:variants",
+    ablations={"no-refined-tracking": {"refine_tracking": False}},
+    mechanism=Mechanism("refined tracking", "displacement by the refined tracking", "no-refined-tracking"),
     presets=splat_presets(SHORT, {}, quick=800, fast=4_000),
     source="GaussianAvatars: Photorealistic Head Avatars with Rigged 3D Gaussians, CVPR 2024, arXiv 2312.02069",
     bibtex=r"""@inproceedings{qian2024gaussianavatars,

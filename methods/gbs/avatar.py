@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
-from ...bench.contracts import FloatArray, HeadPose, no_stage
+from ...bench.contracts import Changes, FloatArray, HeadPose, no_stage
 from ..avatars.compact.layouts import blended, read_coded
 from ..avatars.harmonics import turn_harmonics
-from ..ops.harmonics import sh_degree
+from ..ops.harmonics import C0, sh_degree
 from ..shared.avatar_files import AVATAR_FILE, Subject, read_stored
-from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar
-from .blendshapes import PointMotions, PosedAttributes, Rig, apply_pose
+from ..shared.rendering import LastPose, PlacedSplats, StoredSplatAvatar, changes_of
+from .blendshapes import PointMotions, PosedAttributes, Rig, apply_pose, difference_widths
 from .storage import Stored, stored_of
 
 
@@ -44,12 +45,26 @@ class GBSAvatar(StoredSplatAvatar):
         posed = self._last(pose, no_stage)
         return turn_harmonics(posed.sh_dc, posed.sh_rest, posed.rotation)
 
+    @torch.no_grad()
+    def changes(self, pose: HeadPose) -> Changes:
+        """Effect of the learnt differences."""
+        widths = difference_widths(0)
+        columns = self._differences(self._rig.arguments([pose]))[:, : sum(widths.values())]
+        learnt = dict(zip(widths, columns.split([*widths.values()], dim=1)))
+        opacity = torch.sigmoid(self.stored.neutral["opacities"] + learnt["opacities"][:, 0])
+        return changes_of(
+            {"position": 1000 * learnt["means"], "opacity": opacity, "color": C0 * learnt["sh_dc"]}
+        )
+
     def _posed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PosedAttributes:
-        arguments, stored = self._rig.arguments([pose]), self.stored
+        arguments = self._rig.arguments([pose])
         motions = PointMotions.of(self._rig.motions(arguments))
         end_stage("drive")
-        differences = stored.entries.sum(stored.differences, self._rig.coefficients(arguments))
-        return apply_pose(stored.neutral, differences, motions)
+        return apply_pose(self.stored.neutral, self._differences(arguments), motions)
+
+    def _differences(self, arguments: Mapping[str, Tensor]) -> Tensor:
+        """(N, C) learnt differences of a pose."""
+        return self.stored.entries.sum(self.stored.differences, self._rig.coefficients(arguments))
 
     def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
         posed = self._last(pose, end_stage)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...bench.specs import MethodSpec
+from ...bench.specs import Mechanism, MethodSpec
 
 SHORT: dict[str, Any] = {
     "sample_spacing": 2.0,
@@ -18,6 +18,7 @@ SHORT: dict[str, Any] = {
     "difference_opacity_lr": 5e-3,
 }
 """Learning rates of runs much shorter than published (docs/explanation/methods/gbs.md, "Presets")."""
+NO_DIFFERENCES = {name: 0.0 for name in SHORT if name.startswith("difference_") and name.endswith("_lr")}
 SHORT_SPLATS: dict[str, Any] = {
     "initial_opacity": 0.5,
     "final_rate": 0.1,
@@ -52,6 +53,10 @@ GBS = MethodSpec(
     config="headbench.methods.gbs.config:GBSConfig",
     variants="headbench.methods.avatars.derived.recipes:gbs_variants",
     needs="headbench.methods.shared.needs:splats",
+    ablations={"no-differences": NO_DIFFERENCES},
+    mechanism=Mechanism(
+        "learnt differences", "position, opacity and colour by the learnt differences", "no-differences"
+    ),
     presets=PRESETS,
     head_models=("flame2020", "procedural2020", "ict-facekit"),
     monocular=True,

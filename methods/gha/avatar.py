@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ...bench.contracts import Camera, FloatArray, Frame, HeadAsset, HeadPose, no_stage
+from ...bench.contracts import Camera, Changes, FloatArray, Frame, HeadAsset, HeadPose, no_stage
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...bench.native.dispatch import to_device
@@ -25,12 +25,12 @@ from ..shared.avatar_files import (
     settings_of_text,
     settings_text,
 )
-from ..shared.rendering import Drawn, LastPose, PosedSplats, posed_splats, read_back, splat_depth
+from ..shared.rendering import Drawn, LastPose, PosedSplats, changes_of, posed_splats, read_back, splat_depth
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, write_tensors
 from ..shared.threads import torch_on_one_thread
 from ..splats.cpu import instruction_sets
 from .config import GHAConfig
-from .driving import Driver, HeadMotion, code_size
+from .driving import POSE_SIZE, Driver, HeadMotion, code_size
 from .gaussian_head import POINTS, FeatureSplats, GaussianHead
 
 DRIVING_FILE = "driving.npz"
@@ -118,6 +118,18 @@ class GHAAvatar:
         colors = None if camera is None else splats.features[:, :3].clamp(0, 1)
         world = splats.world._replace(quats=F.normalize(splats.world.quats, dim=1))
         return posed_splats(world, splats.opacities, colors)
+
+    @torch.no_grad()
+    def changes(self, pose: HeadPose) -> Changes:
+        """Gaussians by the expression alone, with the head at rest; colours as in `splats`."""
+        code = self._driver.signals(self._driver.arguments([pose]))[0]
+        points = self._tensors["points"]
+        rest = HeadMotion(torch.eye(3), torch.zeros(3), torch.zeros(POSE_SIZE), torch.eye(4)[0])
+        signal = code._replace(expression=code.expression.to(points))
+        motion = HeadMotion(*(part.to(points) for part in rest))
+        found = self._head.splats(self._tensors, signal, motion, inputs=self._inputs)
+        values = {"position": 1000 * found.world.means, "opacity": found.opacities}
+        return changes_of({**values, "color": found.features[:, :3].clamp(0, 1)})
 
     def files(self) -> Sequence[Path]:
         """The tensors and the subject."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...bench.specs import MethodSpec, ResolutionRule
+from ...bench.specs import Mechanism, MethodSpec, ResolutionRule
 from ..shared.config import PAPER_ITERATIONS
 
 SHORT: dict[str, Any] = {
@@ -49,6 +49,8 @@ SHORT: dict[str, Any] = {
 }
 """Settings of the short presets, which scale with the capture, for CPUs (docs/explanation/methods/gha.md)."""
 
+NO_EXPRESSION = {"near_squared": 0.0, "far_squared": 1e-12, "motion_steps": 0, "motion_weight": 0.0}
+"""Every point, and not only those far from the landmarks, depends on the head's pose alone."""
 SHORT_PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {
         "budget": {"iterations": 60},
@@ -79,6 +81,10 @@ GHA = MethodSpec(
     config="headbench.methods.gha.config:GHAConfig",
     variants="headbench.methods.avatars.derived.recipes:gha_variants",
     needs="headbench.methods.shared.needs:splats",
+    ablations={"no-expression": NO_EXPRESSION},
+    mechanism=Mechanism(
+        "expression networks", "position, opacity and colour by the expression", "no-expression"
+    ),
     presets={
         **SHORT_PRESETS,
         "gpu": {"budget": {"iterations": 30_000}},

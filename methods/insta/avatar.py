@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ...bench.configuration import build
-from ...bench.contracts import Camera, Frame, HeadPose
+from ...bench.contracts import Camera, Changes, Frame, HeadPose
 from ...bench.errors import HeadbenchError, InputError
 from ...bench.io.arrays import Member, check_arrays, read_npz
 from ...bench.io.documents import parse_json, read_json
@@ -20,6 +21,7 @@ from ...bench.native.dispatch import fits
 from ..avatars.compact.container import codec_of
 from ..avatars.compact.layouts import grid, read_coded
 from ..shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, read_shared_head, read_subject, write_arrays
+from ..shared.rendering import changes_of
 from ..shared.subject_mesh import SubjectMesh, pose_key
 from ..shared.threads import threads
 from . import kernel
@@ -107,6 +109,28 @@ class InstaAvatar:
             rgb[rows, columns] = seen.color[inside] + left_over * rgb[rows, columns]
             alpha[rows, columns] = 1 - left_over[:, 0]
         return Frame(rgb.clip(0, 1), alpha.clip(0, 1))
+
+    @torch.no_grad()
+    def changes(self, pose: HeadPose) -> Changes:
+        """Opacity of a step, and colour weighted by it as seen from the front, at the middle of occupied cells at the mouth."""
+        field, parameters = self._inference.field, self._inference.parameters
+        positions, distances = self._mouth_cells
+        condition = torch.tensor(np.asarray(pose.expression), dtype=torch.float32)
+        conditions = condition[None, : field.architecture.conditions]
+        rows = torch.zeros(len(positions), dtype=torch.int64)
+        latent = field.latent(parameters, positions, conditions, rows)
+        opacity = 1 - torch.exp(-self._inference.marching.step * field.density(latent, distances))
+        color = field.color(parameters, latent, torch.tensor([[0.0, 0.0, -1.0]]).repeat(len(positions), 1))
+        return changes_of({"opacity": opacity, "color": opacity[:, None] * color})
+
+    @cached_property
+    def _mouth_cells(self) -> tuple[Tensor, Tensor]:
+        """(N, 3) middles of the occupied cells whose nearest triangle is of the mouth, and (N,) distances to it, metres."""
+        cells = np.argwhere(self.space.occupied) + np.float32(0.5)
+        middles = (self.space.low + self.space.cell * cells).astype(np.float32)
+        triangles, squared = self._surface.rest.nearest(middles)
+        at_mouth = self._inference.mouth[triangles]
+        return torch.from_numpy(middles)[at_mouth], squared[at_mouth].sqrt()
 
     def files(self) -> Sequence[Path]:
         """Field, settings and subject, or the coded file."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...bench.specs import MethodSpec
+from ...bench.specs import Mechanism, MethodSpec
 
 SHORT: dict[str, Any] = {
     "levels": 8,
@@ -45,6 +45,12 @@ INSTA = MethodSpec(
     devices=("cpu",),
     variants="headbench.methods.avatars.derived.recipes:insta_variants",
     needs="headbench.methods.shared.needs:insta",
+    ablations={"no-condition": {"conditions": 0}},
+    mechanism=Mechanism(
+        "expression condition",
+        "opacity and colour of occupied cells at the mouth by the expression",
+        "no-condition",
+    ),
     presets={
         "smoke": {"budget": {"iterations": 40}, **SHORT},
         "quick": {

@@ -18,10 +18,10 @@ from ..ops.planes import Bounds, line_offsets, plane_colors, smoothing
 from ..ops.splats import directions_to, to_world
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View
-from ..shared.schedule import Timeline, torch_generator
+from ..shared.schedule import Timeline, log_linear, torch_generator
 from ..shared.splat_training import ShadedSplats, Start, one_per_triangle
 from ..shared.subject_mesh import BoundedCache, SubjectMesh, centroid_displacements
-from .config import OursConfig
+from .config import RAMP_FROM, OursConfig
 from .field import (
     COLOR_NETWORK,
     FIRST_LAYER,
@@ -143,13 +143,21 @@ class OursAppearance:
             if self._config.penalty.weight:
                 weights = prepared.penalty.index_select(0, binding)
                 size = softened(offsets, self._config.penalty.softness)
-                penalty = self._config.penalty.weight * (size * weights[:, None]).mean()
+                penalty = self._penalty_weight(iteration) * (size * weights[:, None]).mean()
         world = to_world(frames, binding, splats.means, splats.log_scales, splats.quats)
         seen = world.means if self._config.color == "sh" or planes.move_splats else world.means.detach()
         last = self._turn(iteration) if self._config.direction_jitter else None
         directions = directions_to(seen, view.center, prepared.turns, binding, last)
         colors = self._colors(optimiser, positions, directions, iteration)
         return ShadedSplats(world, changed_colors(colors, splats), torch.sigmoid(splats.logits), penalty)
+
+    def _penalty_weight(self, iteration: int) -> float:
+        """Weight of the penalty, which rises over its ramp."""
+        penalty = self._config.penalty
+        ramp = self._timeline.at(penalty.ramp)
+        return penalty.weight * log_linear(
+            RAMP_FROM, 1.0, (iteration - self._lines_from) / ramp if ramp else 1.0
+        )
 
     def offsets(self, optimiser: Optimiser, positions: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
         """(N, D) offsets; zero outside the lines' box."""

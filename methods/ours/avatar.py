@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import HeadPose
+from ...bench.contracts import Changes, HeadPose
 from ...bench.native.dispatch import to_device
+from ...datasets.head.arrays import faces_in_region
 from ..avatars.compact.field import field as field_layout
 from ..avatars.compact.layouts import read_coded
 from ..ops.harmonics import harmonic_shader
-from ..ops.mesh import TriangleFrames
 from ..ops.planes import (
     AXES,
     ENCODING_SIZE,
@@ -29,9 +28,10 @@ from ..ops.planes import (
 )
 from ..ops.splats import activate, to_world
 from ..shared.avatar_files import Subject, read_stored
-from ..shared.rendering import USUAL, Cutoffs, LastPose, PlacedSplats, StoredSplatAvatar
+from ..shared.rendering import USUAL, Cutoffs, LastPose, PlacedSplats, StoredSplatAvatar, changes_of
 from ..shared.subject_mesh import SubjectMesh
-from .appearance import driving_coefficients
+from .appearance import driving_coefficients, penalty_weights
+from .config import OursConfig
 from .field import (
     FIRST_LAYER,
     LAST_LAYER,
@@ -47,16 +47,6 @@ from .field import (
     position_part,
 )
 from .storage import FIELD_FILE, RESIDUAL, StoredField, field_of, splat_columns
-
-
-class DrivenPose(NamedTuple):
-    """What a pose determines, for any camera."""
-
-    frames: TriangleFrames
-    turns: Tensor
-    """(F, 3, 3) world directions to canonical ones."""
-    offsets: Tensor | None
-    """(N, D) of the lines; None without lines."""
 
 
 class LineOffsets:
@@ -108,6 +98,11 @@ class OursAvatar(StoredSplatAvatar):
     Values that depend only on the canonical position (plane features, positions on the lines) are computed once when
     the avatar is loaded. A folder has the files of a training, or the coded file in place of them.
 
+    Parameters
+    ----------
+    face : Tensor | None
+        (F,) bool, triangles of the face, by which `changes` tells penalised splats from others.
+
     Attributes
     ----------
     subject, field : Subject, StoredField
@@ -128,8 +123,11 @@ class OursAvatar(StoredSplatAvatar):
         field: StoredField,
         device: str,
         cutoffs: Cutoffs = USUAL,
+        *,
+        face: Tensor | None = None,
     ):
         tensors = field.tensors
+        self._face = face
         self.subject, self.field = subject, field
         self.mesh = mesh
         columns = {name: part.contiguous() for name, part in splat_columns(tensors["splats"]).items()}
@@ -159,33 +157,51 @@ class OursAvatar(StoredSplatAvatar):
         content_of, coded = partial(field_of, device=device), partial(read_coded, layout=field_layout)
         files, head, subject, field = read_stored(folder, FIELD_FILE, content_of, coded)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
-        return cls(files, mesh, subject, field, device)
+        face = None
+        if "face" in head.regions:
+            face = torch.zeros(len(mesh.faces), dtype=torch.bool, device=device)
+            face[torch.from_numpy(faces_in_region(head, "face")).to(device)] = True
+        return cls(files, mesh, subject, field, device, face=face)
 
-    def _posed(self, pose: HeadPose) -> DrivenPose:
+    @torch.no_grad()
+    def changes(self, pose: HeadPose) -> Changes:
+        """Effect of the lines on the splats inside their box; penalised are those that the published penalty would keep."""
         if self.line_offsets is None:
-            offsets = None
-        else:
-            driving = driving_coefficients(pose, self._expressions, self._jaw_bases)
-            coefficients = to_device(torch.from_numpy(np.concatenate(driving)), self._binding.device)
-            offsets = self.line_offsets(coefficients)
-        frames = self.mesh.drive(pose)
-        return DrivenPose(frames, self._canonical.turns(frames), offsets)
+            return Changes({})
+        rows, changed = self.line_offsets.inside, self._changed(pose)
+        triangles, values = self._binding[rows], {}
+        if "opacity" in self.field.dynamic:
+            values["opacity"] = torch.sigmoid(changed.logits[rows])
+        if "position" in self.field.dynamic:
+            size = self.mesh.frames(self.mesh.canonical).size[triangles]
+            values["position"] = 1000 * (changed.means - self.neutral.means)[rows] * size[:, None]
+        if "color" in self.field.dynamic and changed.color_change is not None:
+            values["color"] = changed.color_change[rows]
+        penalised = None
+        if self._face is not None:
+            unposed = self.mesh.unposed(self.mesh.arguments([pose]))
+            weights = penalty_weights(unposed, self.mesh.canonical, self.mesh.faces, self._face, OursConfig())
+            penalised = (weights[triangles] > 0).cpu().numpy()
+        return changes_of(values, penalised)
 
     def _placed(self, pose: HeadPose, end_stage: Callable[[str], None]) -> PlacedSplats:
-        posed = self._posed(pose)
+        frames = self.mesh.drive(pose)
         end_stage("drive")
-        splats = self._changed(posed)
+        turns, splats = self._canonical.turns(frames), self._changed(pose)
         shape = splats.log_scales, splats.quats
         known = shape[0] is self.neutral.log_scales and shape[1] is self.neutral.quats
         activated = self._activated if known else None
-        world = to_world(posed.frames, self._binding, splats.means, *shape, activated)
+        world = to_world(frames, self._binding, splats.means, *shape, activated)
 
         def colors(center: Tensor) -> Tensor:
-            return changed_colors(self.colors(world.means, center, posed.turns, self._binding), splats)
+            return changed_colors(self.colors(world.means, center, turns, self._binding), splats)
 
         return PlacedSplats(world, torch.sigmoid(splats.logits), colors)
 
-    def _changed(self, posed: DrivenPose) -> LocalSplats:
-        if posed.offsets is None:
+    def _changed(self, pose: HeadPose) -> LocalSplats:
+        """The splats with the offsets of the lines, if any."""
+        if self.line_offsets is None:
             return self.neutral
-        return apply_offsets(self.neutral, posed.offsets, self.field.dynamic)
+        driving = driving_coefficients(pose, self._expressions, self._jaw_bases)
+        coefficients = to_device(torch.from_numpy(np.concatenate(driving)), self._binding.device)
+        return apply_offsets(self.neutral, self.line_offsets(coefficients), self.field.dynamic)

@@ -110,6 +110,10 @@ class Lines:
             raise ValueError(f"dynamic must name at least one attribute, each once, found {self.dynamic}")
 
 
+RAMP_FROM = 1e-3
+"""Fraction of the penalty's weight at the start of its ramp."""
+
+
 @dataclass(frozen=True)
 class Penalty:
     """The adaptive truncated opacity penalty.
@@ -118,6 +122,10 @@ class Penalty:
     ----------
     weight : float
         0 turns it off.
+    ramp : int
+        Iterations (published scale) from the start of the lines in which the weight rises to ``weight``, log-linear from
+        `RAMP_FROM` of it; 0 as published. From lines at 0 the full weight prevents every change (docs/explanation/methods/ours.md,
+        "Feature lines").
     softness : float
         Offsets below which |offset| is replaced by a parabola (Huber 1964), so that the sign of its
         gradient does not jump at 0 and outweigh the image's gradient in the optimiser's second
@@ -128,14 +136,16 @@ class Penalty:
     """
 
     weight: float = 1.0
+    ramp: int = 0
     softness: float = 0.0
     face_mm: float = 1.0
     other_mm: float = 2.0
     other_weight: float = 10.0
 
     def __post_init__(self) -> None:
-        if self.softness < 0:
-            raise ValueError(f"softness must not be negative, found {self.softness}")
+        for name in ("ramp", "softness"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Clip, FloatArray, HeadPose
+from ...bench.contracts import Changes, Clip, FloatArray, HeadPose
 from ...bench.native.dispatch import to_device
 from ..avatars.compact.layouts import read_coded, reduced
 from ..avatars.harmonics import DEGREE
@@ -25,7 +25,7 @@ from ..ops.photometric import photometric_loss
 from ..ops.splats import WorldSplats
 from ..shared.loop import recomposited
 from ..shared.networks import initial_network, tracked_inputs
-from ..shared.rendering import PlacedSplats, View, pixel_sums, rasterize_view
+from ..shared.rendering import PlacedSplats, View, changes_of, pixel_sums, rasterize_view
 from ..shared.schedule import Batches, GroupedBatches, log_linear, numpy_generator
 from ..shared.splat_training import initial_shapes
 from ..shared.surface_splats import SurfaceAvatar, SurfaceMethod, SurfaceTrainer
@@ -251,6 +251,12 @@ class RGBAvatarAvatar(SurfaceAvatar[StoredShapes]):
         """Colours of a pose, equal in all directions; see `HarmonicAvatar`."""
         colors = self._blended(self.mesh.arguments([pose]))["colors"].cpu().numpy()
         return colors, np.zeros((*colors.shape, coefficient_count(DEGREE) - 1), np.float32)
+
+    @torch.no_grad()
+    def changes(self, pose: HeadPose) -> Changes:
+        """Effect of the blendshapes."""
+        splats = self._blended(self.mesh.arguments([pose]))
+        return changes_of({"position": 1000 * splats["means"], "color": seen_colors(splats["colors"])})
 
     def _blended(self, arguments: Mapping[str, Tensor]) -> dict[str, Tensor]:
         inputs = tracked_inputs(arguments, self.stored.settings.inputs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...bench.specs import MethodSpec
+from ...bench.specs import Mechanism, MethodSpec
 
 NERSEMBLE: dict[str, Any] = {
     "schedule_length": 30_000,
@@ -58,6 +58,10 @@ RGBAVATAR = MethodSpec(
     config="headbench.methods.rgbavatar.config:RGBAvatarConfig",
     variants="headbench.methods.avatars.derived.recipes:rgbavatar_variants",
     needs="headbench.methods.shared.needs:splats",
+    ablations={"no-blendshapes": dict.fromkeys(("position_share", "rotation_share", "color_share"), 0.0)},
+    mechanism=Mechanism(
+        "learnt blendshapes", "position and colour by the learnt blendshapes", "no-blendshapes"
+    ),
     presets=PRESETS,
     source="RGBAvatar: Reduced Gaussian Blendshapes for Online Modeling of Head Avatars, CVPR 2025, arXiv 2503.12886",
     bibtex=r"""@inproceedings{li2025rgbavatar,

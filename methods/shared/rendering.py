@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Camera, FloatArray, Frame, HeadPose, no_stage
+from ...bench.contracts import BoolArray, Camera, Changes, FloatArray, Frame, HeadPose, no_stage
 from ...bench.native.dispatch import is_cuda, on_host, to_device
 from ..avatars.compact.container import codec_of
 from ..ops.splats import WorldSplats
@@ -169,6 +169,11 @@ def posed_splats(world: WorldSplats, opacities: Tensor, colors: Tensor | None) -
     """Copy to numpy, since avatars reuse tensors for the next frame."""
     means, quats, scales, of_splats = (_numpy(values).copy() for values in (*world, opacities))
     return PosedSplats(means, quats, scales, of_splats, None if colors is None else _numpy(colors).copy())
+
+
+def changes_of(values: Mapping[str, Tensor], penalised: BoolArray | None = None) -> Changes:
+    """`Changes` of tensors by quantity."""
+    return Changes({name: _numpy(each) for name, each in values.items()}, penalised)
 
 
 def _numpy(values: Tensor) -> np.ndarray:

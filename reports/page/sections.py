@@ -23,6 +23,7 @@ from ...bench.registry import get
 from ...bench.rows import ALL
 from ...bench.specs import MethodSpec, MetricSpec
 from ..aggregate import summarise
+from ..conditions import mechanisms
 from ..pareto.points import SIZE, SPEED
 from ..runs import RunData, RunSet
 from ..statistics.comparisons import subjects_needed
@@ -60,6 +61,7 @@ def verdict(
     tasks = runs.by_camera.tasks
     if below := not_better(runs.by_camera.rows, metrics, methods, runs.trivial, tasks):
         found.sentences += [Markup("<b>{}</b>").format(" ".join(below.values())), Markup.escape(BELOW_CAUSES)]
+    found.sentences += [Markup("<b>{}</b>").format(text) for text in mechanisms(runs.rows, methods)[1]]
     methods = tuple(name for name in methods if name not in below)
     for task in runs.by_camera.tasks if metrics else ():
         if scores := _scores(runs.by_camera, methods, metrics[0], task):

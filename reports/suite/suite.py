@@ -269,6 +269,7 @@ AVATAR_TABLES = {
         "coded_change",
     ),
     "speed": ("fps", "fps_one_thread", "fps_without_head", "processor_time"),
+    "mechanism": ("dynamic_splats", "opacity_range", "color_range", "position_range"),
 }
 """Metrics of the tables without frames, by layout."""
 
@@ -347,16 +348,16 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
         own = whole.only([*changed, *changed.values()]).shared
         for region in regions:
             sections.append(_condition_section(own.of(FrameSelection(region)), condition, changed, region))
-    ablations: dict[str, dict[str, str]] = {name: {} for name in ("", *tracking)}
-    """Name of each ablation by its label, for each condition of tracking."""
+    ablations: dict[tuple[str, str], dict[str, str]] = {}
+    """Name of each ablation by its label, by condition of tracking and method."""
     for condition, by_name in by_condition.items():
-        if method in by_name and condition not in ("", EQUAL, AS_TRACKED, *tracking):
+        if condition not in ("", EQUAL, AS_TRACKED, *tracking):
             under = next((name for name in tracking if condition.endswith(f"-{name}")), "")
-            ablations[under][by_name[method]] = condition.removesuffix(f"-{under}")
-    for under, named in ablations.items():
-        if named:
-            parts_shown = tested if not under else ()
-            sections += _ablation_sections(whole, by_condition[under][method], named, regions, parts_shown)
+            for name, label in by_name.items():
+                ablations.setdefault((under, name), {})[label] = condition.removesuffix(f"-{under}")
+    for under, name in sorted(ablations, key=lambda place: ["", *tracking].index(place[0])):
+        parts_shown, named = tested if not under else (), ablations[under, name]
+        sections += _ablation_sections(whole, by_condition[under][name], named, regions, parts_shown)
     return "\n\n".join(sections) + "\n"
 
 

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from headbench.bench.contracts import STAGES, HeadPose
+from headbench.bench.contracts import STAGES, Changes, HeadPose
 from headbench.bench.engine.config import default_names
 from headbench.bench.registry import discover, resolve
 
@@ -13,9 +13,10 @@ SPECS = [
 BY_NAME = {spec.name: spec for spec in SPECS}
 
 
-def test_more_is_better_of_rates_alone_among_what_avatars_cost():
+def test_more_is_better_of_rates_and_mechanisms_alone():
     rising = {s.name for s in SPECS if s.higher_is_better and not s.per_frame}
-    assert rising == {"fps", "fps_one_thread", "fps_without_head", "throughput"}
+    alive = {s.name for s in SPECS if s.kind == "mechanism"}
+    assert rising == {"fps", "fps_one_thread", "fps_without_head", "throughput", *alive}
 
 
 def test_a_run_measures_every_cost_unless_told_otherwise():
@@ -44,10 +45,13 @@ def test_details_are_among_those_that_the_measurement_gives(tmp_path):
         def splats(self, pose):
             return SimpleNamespace(means=np.zeros((1, 3)))
 
+        def changes(self, pose):
+            return Changes(dict.fromkeys(("opacity", "color", "position"), np.zeros(2)), np.zeros(2, bool))
+
     (tmp_path / "file").write_bytes(b"1")
     zero = np.zeros(3)
     pose = HeadPose("toy", zero, zero, zero, zero, zero, zero)
-    for implementation in (BY_NAME["storage"].implementation, BY_NAME["fps"].implementation):
+    for implementation in {BY_NAME[name].implementation for name in ("storage", "fps", "dynamic_splats")}:
         details = resolve(implementation)(Avatar(), [("a", pose), ("b", pose)]).details
         asked = {s.detail for s in SPECS if s.implementation == implementation} - {""}
         assert asked <= set(details)

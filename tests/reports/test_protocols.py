@@ -129,6 +129,9 @@ def test_differences_from_the_published_conditions_are_said(runs):
     assert "Pixels: 120x174; in the protocol: 275x401." in text
     assert "Mean over frames, then sequences, then subjects" in text
     assert "Mean over frames, then subjects" in table_text([GALLERY], "md", protocol="mogaface-2026")
+    assert "fitted to" not in text
+    text = table_text([GALLERY], "md", protocol="fate-2025-imavatar")
+    assert "Scored frames: as tracked; in the protocol: fitted to their own pictures" in text
 
 
 @pytest.mark.commands

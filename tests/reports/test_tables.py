@@ -5,10 +5,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
-from headbench.bench.specs import MetricSpec
+from headbench.bench.rows import Rows
+from headbench.bench.specs import Mechanism, MetricSpec
+from headbench.reports.tables import build_table
 from headbench.reports.writers import to_markdown, to_text
 
-from .made_rows import row, table_of
+from .made_rows import avatar_row, row, table_of
 
 METRIC = MetricSpec("m", "M", "", True, 2, "m:m")
 
@@ -48,15 +50,38 @@ def test_a_trivial_baseline_is_listed_apart_and_never_ranked(make_rows, metrics)
     assert "bold" not in alone.caption
 
 
+def test_a_mechanism_that_is_off_is_named_and_none_is_ranked(make_rows, metrics):
+    spec = MetricSpec("dynamic_splats", "Dynamic", "%", True, 1, "m:m", kind="mechanism")
+    lines = Mechanism("lines", "opacity", "none")
+    found = {"a": [3.0, 4.0], "b": [0.0, 40.0], "c": [8.0, 8.0], "none": [0.0, 0.0]}  # of two subjects
+    rows = [
+        avatar_row(method, spec.name, value, subject, reason=lines.told(value, method))
+        for method, values in found.items()
+        for subject, value in zip("st", values)
+    ]
+    table = build_table(Rows.of(rows), [spec], [*found], [], protocol_ids={})
+    assert table.warnings == ("a: lines off: 3.5 % of the splats change (opacity).",)
+    assert {cell.rank for row in table.rows for cell in row.cells} == {None}
+    assert table.notes == ("lines: opacity.", "lines left out: opacity.")
+    assert to_text(table).startswith(table.warnings[0])
+
+
 def test_a_method_below_a_baseline_is_named_first_and_not_ranked(make_rows, metrics):
-    values = {"floor": 1.5, "lower": 0.5, "a": 1.0, "b": 2.0, "c": 3.0}
-    table = table_of(make_rows(values), metrics, values, trivial=["floor", "lower"])
+    values = {"floor": 1.5, "lower": 0.5, "floor+fitted": 2.5, "a": 1.0, "b": 2.0, "c": 3.0}
+    table = table_of(make_rows(values), metrics, values, trivial=["floor", "lower", "floor+fitted"])
     assert [(title, [r.method for r in rows]) for title, rows in table.groups] == [
         ("Methods", ["b", "c"]),
         ("Not better than a trivial baseline (not ranked)", ["a"]),
-        ("Trivial baselines (not ranked)", ["floor", "lower"]),
+        ("Trivial baselines (not ranked)", ["floor", "lower", "floor+fitted"]),
     ]
-    assert ranks(table, "psnr") == {"a": None, "b": 2, "c": 1, "floor": None, "lower": None}
+    assert ranks(table, "psnr") == {
+        "a": None,
+        "b": 2,
+        "c": 1,
+        "floor": None,
+        "lower": None,
+        "floor+fitted": None,
+    }
     assert table.warnings[0] == "a is not better than floor in novel view: PSNR 1.00 against 1.50 dB."
     assert to_text(table).startswith(table.warnings[0])
     assert table.warnings[0] in to_markdown(table)

@@ -47,6 +47,11 @@ def test_a_condition_that_cannot_be_had_is_refused(config, toy, condition, match
             {"conditions": [{}, {"name": "c", "derive": {"name": "variant"}, "budget": "1/2"}]},
             "nothing is trained",
         ),
+        ({"conditions": [{"name": "c", "views": {"name": "test-refit"}}]}, "or a source that names"),
+        (
+            {"conditions": [{"name": "c", "drive": {"name": "d"}, "views": {"name": "v"}}], "source": "r"},
+            "both",
+        ),
     ],
 )
 def test_conditions_that_are_none_are_refused(values, match):

@@ -10,6 +10,7 @@ import pytest
 
 from headbench.bench.contracts import FrameKey
 from headbench.bench.engine import scoring
+from headbench.bench.engine.cell import training_poses
 from headbench.bench.engine.config import RunConfig, resolve_metrics
 from headbench.bench.engine.scoring import ScoredFrames, check_regions, score_frames
 from headbench.bench.errors import HeadbenchError, InputError, LeftOutError, UnavailableError
@@ -243,3 +244,20 @@ def test_a_metric_that_can_computes_on_the_gpu_of_the_run(monkeypatch, device, t
     (plain,) = score_frames(KEYS[:1], ScoredFrames(render, RegionalToyClip()), [spec])["d"]
     (found,) = score_frames(KEYS[:1], ScoredFrames(render, RegionalToyClip()), [spec], device=device)["d"]
     assert found.value == plain.value + more
+
+
+@pytest.mark.parametrize("count", [1, 3, 200, 500])
+def test_a_mechanism_is_measured_over_training_timesteps(count):
+    """Each once and in order, evenly thinned if they are many."""
+    train = [FrameKey("s", "EMO", 10 * t, camera) for t in reversed(range(count)) for camera in "ba"]
+    clip = SimpleNamespace(
+        splits={"train": train, "novel_view": [FrameKey("s", "EMO", 5, "a")]},
+        cameras={name: name for name in "ab"},
+        poses={t: t for t in range(10 * count)},
+    )
+    cameras, poses = zip(*training_poses(clip))
+    assert set(cameras) == {"a"}
+    assert len(poses) == min(count, 200)
+    assert poses[0] == 0
+    steps = np.diff(poses)
+    assert set(steps) <= ({10} if count <= 200 else {20, 30})

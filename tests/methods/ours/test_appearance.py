@@ -120,6 +120,16 @@ def test_face_bounds_reach_fewer_splats_than_head_bounds(clip):
     assert 0 < moved["face"] < moved["head"]
 
 
+@pytest.mark.parametrize(
+    ("iteration", "part"), [(60_001, 1e-3), (90_000, 10**-1.5), (120_000, 1.0), (500_000, 1.0)]
+)
+def test_the_penalty_rises_geometrically_over_its_ramp(clip, iteration, part):
+    """By a factor of 1000, whose logarithm is linear in the iterations since the start of the lines."""
+    config = changed(SMALL, penalty={"ramp": 60_000})
+    full, risen = (place(clip, *make(clip, each), iteration).penalty.item() for each in (SMALL, config))
+    assert risen / full == pytest.approx(part, rel=1e-3)
+
+
 @pytest.mark.parametrize("switch", ["lines", "penalty"])
 def test_switches(clip, switch):
     settings = {"lines": {"enabled": False}} if switch == "lines" else {"penalty": {"weight": 0.0}}
