@@ -24,6 +24,7 @@ from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
+from headbench.bench.manifest import Manifest
 from headbench.bench.registry import Plugin
 from headbench.bench.rows import Rows
 from headbench.bench.specs import ReportSpec
@@ -515,6 +516,21 @@ def test_two_runs_in_one_folder_are_refused_before_training(config, refuses):
         refuses(config, "no other process works in")
     runner.run(config)
     assert not (Path(config.out) / "run.lock").exists()
+
+
+WRITE_REPORTS = runner.write_reports
+
+
+def test_reports_open_neither_run_nor_captures_again(config, toy, monkeypatch):
+    opened = []
+    monkeypatch.setattr(runner, "write_reports", WRITE_REPORTS)
+    monkeypatch.setattr(toy, "read", lambda path: opened.append(path) or toy.ToyClip(path))
+    for kind in (Manifest, Rows):
+        monkeypatch.setattr(kind, "read", lambda path: pytest.fail("read again"))
+    folder = runner.run(replace(config, metrics=("psnr",))).folder
+    assert folder.page.is_file()
+    assert folder.contact_sheet.is_file()
+    assert len(opened) == 2  # subjects
 
 
 def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
