@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -18,7 +17,7 @@ from ..condition import PLAIN, Condition, label_of
 from ..contracts import Avatar, CheckedMethod, Clip, FrameKey, Progress
 from ..errors import InputError
 from ..io.documents import read_json
-from ..io.files import atomic_path, digest, output_inside, refuse_links, to_jsonable
+from ..io.files import atomic_path, digest, output_inside, refuse_links
 from ..machine import machine_record
 from ..manifest import (
     AdaptedRecord,
@@ -191,10 +190,13 @@ def source_fingerprint(job: Job) -> str:
     """
     assert job.source is not None
     record = trained_record(job.source)
-    own = json.loads(json.dumps(job.method.record()["config"], default=to_jsonable))
-    if record.get("method", {}).get("config", own) != own:
-        expected, remedy = "an avatar of the settings of this run", "Give the settings of the source."
-        raise InputError(job.source.file, "method.config", expected, "one of other settings", remedy)
+    now = job.method.identity()["config"]
+    then = record.get("method", {}).get("config", now)
+    changed = [*differences(then and {name: then.get(name) for name in now}, now, "method.config")][:3]
+    if changed:
+        keys, found, wanted = (", ".join(each) for each in zip(*changed))
+        expected = f"an avatar of the settings of this run, {wanted}"
+        raise InputError(job.source.file, keys, expected, found, "Give the settings of the source.")
     file = job.source.avatar / AVATAR_FILE
     capture = read_json(file).get("origin", {}).get("capture") if file.is_file() else None
     if capture not in (None, job.form.clip.fingerprint):
