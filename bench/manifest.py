@@ -284,6 +284,8 @@ class Manifest:
         for condition in record["configuration"]["conditions"]:
             if not condition["as_tracked"]:
                 del condition["as_tracked"]
+            if not condition["views"]["name"]:
+                del condition["views"]
         for clip in record["clips"]:
             if not clip["training_cameras"]:
                 del clip["training_cameras"]
