@@ -15,12 +15,12 @@ from .contracts import Avatar, ByteArray, Clip, FrameKey, TaskName
 from .engine import run as runner
 from .engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
 from .engine.captures import capture_configuration, open_clips, reader_of
+from .engine.cell import train as train_cell
 from .engine.config import ResolvedMethod, build_run_config, default_names, resolve_methods
-from .engine.job import Job
+from .engine.plan import Job, check_settings
 from .engine.scoring import ScoredFrames, check_regions, score_frames
 from .engine.store import RunFolder
 from .engine.stored import open_avatar
-from .engine.training import fit
 from .errors import InputError
 from .io.files import check_output_folder
 from .io.images import quantise
@@ -124,14 +124,13 @@ def train(
     (resolved,) = resolve_methods(build_run_config({**values, "settings": chosen}, "train"))
     folder = RunFolder(Path(out))
     check_output_folder(folder.root)
-    runner.check_settings([(resolved, PLAIN)])
+    check_settings([(resolved, PLAIN)])
     with locked(folder.root):
         form = _adapted(clip, resolved, {}, folder.adapted / clip.subject)
         cell = folder.cell(clip.subject, resolved.spec.name, seed)
         job = Job(clip, resolved, seed, device, cell, {}, form)
         job.check()
-        job.check_method()
-        fit(job)
+        train_cell(job)
     return cell.avatar
 
 

@@ -7,9 +7,9 @@ import logging
 import os
 import shlex
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,11 +22,13 @@ from .engine.config import (
     QUICK,
     DemoConfig,
     RunConfig,
+    RunOptions,
     build_run_config,
     coded_conditions,
     demo_run_config,
     resolve_methods,
     resolve_metrics,
+    with_methods,
 )
 from .errors import HeadbenchError, InputError
 from .executors.options import chosen_execution
@@ -47,6 +49,7 @@ from .registry import get, resolve
 from .specs import CommandResult
 
 if TYPE_CHECKING:
+    from .engine.store import FinishedRun
     from .rows import Rows
 
 log = logging.getLogger(__name__)
@@ -89,6 +92,8 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
 
     With the preset "quick", avatars are trained beside each other, with one thread each: a training keeps about 1.2 of 2 cores busy.
     """
+    from .engine.run import run as run_comparison  # slow to import
+
     values = parse_assignments(settings.set)
     if "preset" in values:
         raise InputError("command line", "--set preset", "--preset of the demo", str(values["preset"]))
@@ -122,7 +127,8 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
             make = resolve(get("datasets", "synthetic").implementation)
             make(**arguments, progress=report)
         execution = Execution("processes") if beside else None
-        result = _run(comparison, execution, capture_seconds=round(time.perf_counter() - start, 3))
+        seconds = round(time.perf_counter() - start, 3)
+        result = _result(run_comparison(comparison, execution, capture_seconds=seconds))
     return result._replace(text=f"{result.text}\n{ONE_SUBJECT}")
 
 
@@ -136,12 +142,16 @@ class RunSettings:
     data: str | None = None
     """Capture, such as one in the GaussianAvatars/VHAP layout: a UNION folder, a sequence folder, or a folder of them."""
     out: str | None = None
-    """Output folder. An existing run in it is continued: methods, seeds, metrics, conditions, tasks and
-    frames are added, and every method is trained with every seed. Settings of existing results cannot be
-    changed."""
+    """Output folder. The same configuration continues the run in it; another one needs a folder of its own. `headbench table`,
+    `compare` and `report` take several runs."""
+    source: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Folder of a finished run: render and measure its avatars in --out instead of training, with its configuration except for
+    the options given here, such as --metrics."""
     methods: str | None = None
     """Names, separated by commas; see `headbench list methods`. Default:
     mean-image,nearest-camera,ga,ours."""
+    metrics: str | None = None
+    """Names, separated by commas; see `headbench list metrics`."""
     preset: str | None = None
     """Length of the training: smoke (seconds), demo (minutes), fast, paper (the published schedule), or another preset that all
     methods of the run have, as listed above. Default: fast."""
@@ -177,18 +187,20 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
     """Train methods on a capture, render, measure, and write tables and pictures."""
     values: dict[str, Any] = read_yaml(Path(settings.config)) if settings.config else {}
     values = with_homes(values, settings.config or "")
-    given = {name: getattr(settings, name) for name in ("data", "out", "methods", "preset", "seeds")}
+    given = {n: getattr(settings, n) for n in ("data", "out", "methods", "metrics", "preset", "seeds")}
     values = merge(values, {key: value for key, value in given.items() if value is not None})
     if settings.head is not None:
         values = merge(values, {"reader_settings": {"head": settings.head}})
     source = settings.config or "command line"
-    for key in ("data", "out"):
-        if key not in values:
-            raise InputError(source, key, f"--{key} or the key {key} in --config", "neither")
     assigned = parse_assignments(settings.set)
     values = merge(values, assigned)
     if settings.protocol:
         values = merge(values, needed(settings.protocol, values))
+    if settings.source is not None:
+        values = merge(_configuration_of(Path(settings.source), values, settings), values)
+    for key in ("data", "out"):
+        if key not in values:
+            raise InputError(source, key, f"--{key} or the key {key} in --config", "neither")
     if "reader" not in values and isinstance(values["data"], str):
         from .engine.captures import reader_of  # slow to import
 
@@ -201,6 +213,8 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
         source,
     )
     config = build_run_config(values, source)
+    if settings.source is not None:
+        config = with_methods(config, [get("methods", name).name for name in config.methods])
     check_kind(Path(config.out), "a run")  # before the log is written there
     if settings.dry_run:
         from .engine.run import planned_cells
@@ -215,18 +229,29 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
 
         for clip in open_clips(config):
             check_capture(settings.protocol, clip)
-    with _log_file(Path(config.out)):
-        return _run(config, execution, unchecked=settings.unchecked)
-
-
-def _run(config: RunConfig, execution: Execution | None = None, **record: Any) -> CommandResult:
     from .engine.run import run as run_comparison
 
-    rows = run_comparison(config, execution, **record)
-    text = f"{_table([config.out], fit=True)}\n{closing(Path(config.out), rows)}"
-    return CommandResult(
-        text, {"out": config.out, "failed": rows.failed, "means": means(config.out)}, not rows.failed
-    )
+    with _log_file(Path(config.out)):
+        return _result(run_comparison(config, execution, unchecked=settings.unchecked))
+
+
+def _configuration_of(run: Path, values: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
+    """Configuration of a run whose avatars are used. Raises `InputError` for code that it names and the ``values`` do not."""
+    from .engine.captures import PROGRAMS, check_trusted, programs, run_configuration
+
+    used: Any = tuple(group for group in ("methods", "metrics") if group not in values)
+    lists = [value.split(",") if isinstance(value, str) else value for value in values.values()]
+    given = {name for names in lists if isinstance(names, (list, tuple)) for name in names}
+    config = run_configuration(run, RunOptions(data=settings.data, head=settings.head), used, given)
+    started = programs(config.methods) if "methods" in used else ()
+    check_trusted(run, {"metric_profiles": config.metric_profiles, PROGRAMS: started}, given, trust=False)
+    return {**asdict(config), "source": str(run)}
+
+
+def _result(run: FinishedRun) -> CommandResult:
+    text = f"{_table([run], fit=True)}\n{closing(run.folder.root, run.rows)}"
+    data = {"out": str(run.folder.root), "failed": run.rows.failed, "means": means(run)}
+    return CommandResult(text, data, not run.rows.failed)
 
 
 def closing(run: Path, rows: Rows) -> str:
@@ -249,14 +274,14 @@ def closing(run: Path, rows: Rows) -> str:
     return "\n".join([first, second, f"Next: {'; '.join([*why, tried, tested])}"])
 
 
-def _table(runs: Sequence[str], **options: Any) -> str:
-    text: str = resolve(get("reports", "table-text").implementation)(list(map(Path, runs)), **options)
+def _table(runs: Sequence[FinishedRun], **options: Any) -> str:
+    text: str = resolve(get("reports", "table-text").implementation)(runs, **options)
     return text
 
 
-def means(run_folder: str) -> list[dict[str, Any]]:
+def means(run: FinishedRun) -> list[dict[str, Any]]:
     """Values of the comparison table for JSON output; None if there is no table."""
-    table = json.loads(_table([run_folder], format="json"))
+    table = json.loads(_table([run], format="json"))
     return [
         {
             **{name: column[name] for name in ("task", "metric")},

@@ -6,8 +6,9 @@ Protocols are referenced by hash; each is in a separate file, ``protocols/<hash>
 from __future__ import annotations
 
 import json
+import logging
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,9 +18,12 @@ from .contracts import FrameKey
 from .engine.config import RunConfig
 from .errors import InputError
 from .io.documents import checked, read_json, shown
-from .io.files import check_name, digest, write_json, write_text
+from .io.files import check_name, digest, to_jsonable, write_json, write_text
+from .progress import counted
 from .protocol import Protocol
 from .specs import LABEL, MetricSpec, is_label
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -145,15 +149,50 @@ def _read_protocol(run: Path, task: str, name: str) -> ProtocolRecord:
     return record
 
 
+ELSEWHERE = ("out", "data", "heads", "settings")
+"""Entries of a configuration that are compared by what they lead to: fingerprints of captures, settings of methods."""
+UNCHANGED = (
+    "A run does not change: choose another --out. Tables, comparisons and reports take several runs, and `headbench run --from "
+    "RUN --metrics NAMES` measures more of the same avatars."
+)
+OLD = "The folder is of an earlier version of headbench; make the run again, in another folder."
+
+
+def differences(then: Any, now: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
+    """Dotted key and both values, as text, of each value that differs between nested mappings; "none" where there is none."""
+    then, now = _plain(then), _plain(now)
+    if isinstance(then, dict) and isinstance(now, dict):
+        for name in dict.fromkeys((*now, *then)):
+            yield from differences(then.get(name), now.get(name), f"{key}.{name}" if key else name)
+    elif then != now:
+        yield key, _text(then), _text(now)
+
+
+def _plain(value: Any) -> Any:
+    """A value as in a JSON file; named entries of a list by their name."""
+    value = json.loads(json.dumps(value, default=to_jsonable))
+    if (
+        isinstance(value, list)
+        and value
+        and all(isinstance(entry, dict) and "name" in entry for entry in value)
+    ):
+        return {entry["name"]: entry for entry in value}
+    return value
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, dict):
+        texts = ((name, _text(entry)) for name, entry in value.items() if entry)
+        return ", ".join(f"{name} {text}" for name, text in texts if text)
+    return ", ".join(map(str, value)) if isinstance(value, list) else "none" if value is None else str(value)
+
+
 @dataclass(frozen=True)
 class Manifest:
     """Everything that determined the values of a run.
 
     Attributes
     ----------
-    paths : dict[str, str] | None
-        Files and folders of the configuration by dotted key, relative to the run folder; None in
-        stored results, which contain no paths of the machine that wrote them.
     metrics, methods, protocols : tuple[MetricSpec, ...], tuple[MethodRecord, ...], dict[str, ProtocolRecord]
         In the order of the configuration; protocols by task, in files of their own.
     machine : dict[str, Any]
@@ -176,13 +215,12 @@ class Manifest:
     protocols: dict[str, ProtocolRecord]
     machine: dict[str, Any]
     status: Literal["started", "done"] = "started"
-    paths: dict[str, str] | None = None
     adapted: tuple[AdaptedRecord, ...] = ()
     seconds: float | None = None
     peak_memory_bytes: int | None = None
     capture_seconds: float | None = None
     unchecked: bool | None = None
-    format: Literal[2] = 2
+    format: Literal[3] = 3
 
     @classmethod
     def read(cls, path: Path) -> Manifest:
@@ -191,8 +229,8 @@ class Manifest:
         Names used in paths are checked as by `check_name`.
         """
         record = read_json(path)
-        if record.get("format") != 2:
-            raise InputError(path, "format", "2", shown(record.get("format")))
+        if record.get("format") != 3:
+            raise InputError(path, "format", "3", shown(record.get("format")), OLD)
         hashes = checked(record.get(PROTOCOLS), dict[str, str], path, PROTOCOLS)
         manifest = checked({**record, PROTOCOLS: {}}, cls, path)
         named: dict[str, set[str]] = {
@@ -246,12 +284,52 @@ class Manifest:
         for condition in record["configuration"]["conditions"]:
             if not condition["as_tracked"]:
                 del condition["as_tracked"]
+            if not condition["views"]["name"]:
+                del condition["views"]
         for clip in record["clips"]:
             if not clip["training_cameras"]:
                 del clip["training_cameras"]
         for metric in record["metrics"]:
             del metric["default"], metric["needs"], metric["suspect_above"]
         write_json(path, record)
+
+    def check_same(self, earlier: Manifest, methods: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+        """Raise `InputError` if the run in the file ``path``, ``earlier``, is another than this one.
+
+        ``methods`` has what decides the results of each method, by label, see `ResolvedMethod.identity`. Where the files
+        lie is no difference: the fingerprints of the captures tell. Changed code of a method of this package is a warning.
+        """
+        settings, results = zip(*(each._compared for each in (earlier, self)))
+        found = [*differences(*settings)]
+        if not found:
+            found = [*differences(*results)]
+            for record in earlier.methods:
+                own = methods[record.label]
+                changed = differences({name: getattr(record, name) for name in own}, own)
+                found += [(f"methods.{record.label}.{key}", old, new) for key, old, new in changed]
+        if found:
+            keys, before, wanted = ([each[place] for each in found[:3]] for place in range(3))
+            more = f" and {counted(len(found) - 3, 'other difference')}" if found[3:] else ""
+            expected = f"{'; '.join(before)}, as in this run"
+            raise InputError(path, ", ".join(keys) + more, expected, "; ".join(wanted), UNCHANGED)
+        codes = {method.label: method.code for method in self.methods}
+        for record in earlier.methods:
+            if codes[record.label] != record.code:
+                log.warning(
+                    "The code of %s has changed since this run was begun; its avatars are kept because the version is still %s.",
+                    *(record.label, record.version),
+                )
+
+    @property
+    def _compared(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What was asked for, and what it led to."""
+        settings = {key: value for key, value in asdict(self.configuration).items() if key not in ELSEWHERE}
+        return {"configuration": settings}, {
+            "methods": [method.label for method in self.methods],
+            "metrics": {metric.name: metric.implementation for metric in self.metrics},
+            "captures": {clip.subject: clip.fingerprint for clip in self.clips},
+            "protocols": {task: protocol.hash for task, protocol in self.protocols.items()},
+        }
 
     def check_done(self, path: Path) -> None:
         """Raise `InputError` for an unfinished run."""

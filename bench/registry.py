@@ -72,17 +72,18 @@ def discover(group: Group) -> dict[str, Plugin]:
 
 
 def get(group: Group, name: str) -> Any:
-    """Return the spec called ``name``, or named by ``"package.module:ATTRIBUTE"`` (a plug-in not yet packaged).
+    """Return the spec called ``name``, or named by ``"package.module:ATTRIBUTE"`` (a plug-in not yet packaged); no other is loaded.
 
     Raises `InputError` for an unknown name (with the nearest one), `HeadbenchError` for a broken plug-in.
     """
     if ":" in name:
         return _checked(resolve(name), group, name)
-    plugins = discover(group)
-    if name not in plugins:
+    entries = entry_points(group=f"headbench.{group}")
+    found = sorted((entry for entry in entries if entry.name == name), key=lambda e: _origin(e) != _OWN)
+    if not found:
         hint = "A plug-in is known when its package is installed here."
-        raise unknown(f"registry of {group}", "name", name, plugins, hint)
-    plugin = plugins[name]
+        raise unknown(f"registry of {group}", "name", name, {entry.name for entry in entries}, hint)
+    plugin = _load(found[0], group)
     if plugin.spec is None:
         raise HeadbenchError(f"{group[:-1]} {name!r} of {plugin.origin} is broken: {plugin.error}")
     return plugin.spec

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from .condition import label_of
 from .contracts import IntArray
-from .errors import InputError, is_damage, shortened
+from .errors import InputError, shortened
 from .io.files import atomic_path, open_regular, reading
 from .specs import LABEL, is_label
 
@@ -203,11 +203,6 @@ class Rows:
     def metrics(self) -> set[str]:
         """Metrics of the rows."""
         return set(self._table["metric"].unique())
-
-    @property
-    def metrics_with_values(self) -> set[str]:
-        """Metrics with at least one value."""
-        return set(self._table.loc[self._table["status"] == "ok", "metric"].unique())
 
     @property
     def subjects(self) -> set[str]:
@@ -400,34 +395,6 @@ class Rows:
             found = ", ".join(self.versions(str(mixed.index[0])))
             raise InputError("rows", f"version of {mixed.index[0]}", "one version of each method", found)
 
-    def values_lacking(self, other: Rows) -> list[str]:
-        """Values that ``other`` has and these rows lack, regardless of version and protocol."""
-        columns = ["metric", "region", "method", "seed", "task", *FRAME, "condition"]
-        theirs, own = (r._table.loc[r._table["status"] == "ok", columns] for r in (other, self))
-        lacking = theirs[~pd.MultiIndex.from_frame(theirs).isin(pd.MultiIndex.from_frame(own))]
-        return [" ".join(map(str, row)).rstrip() for row in lacking.itertuples(index=False, name=None)]
-
-    def check_kept(self, path: Path, **planned: Iterable[str | int]) -> None:
-        """Refuse, before any work, to replace these rows, read from ``path``, by rows that lack some of their values.
-
-        Parameters
-        ----------
-        planned : Iterable[str | int]
-            Values of the new rows, by column of `Row`.
-
-        Raises
-        ------
-        InputError
-            These rows have values in one of the columns that the new rows lack.
-        """
-        for column, values in planned.items():
-            named = list(map(str, values))
-            known = set(map(str, self._table[column].unique())) - {""}
-            if lost := sorted(known - set(named)):
-                expected = f"all that it has results for ({', '.join(sorted(known))}), and optionally more"
-                found = f"{', '.join(named)} without {', '.join(lost)}"
-                raise InputError(path, f"{column}s", expected, found, DISCARD)
-
     def check_protocols(self, source: Path | str, expected: Mapping[str, str] | None = None) -> None:
         """Raise `InputError` if rows of one task have several protocols, or a protocol other than ``expected``.
 
@@ -445,35 +412,6 @@ class Rows:
 
     def _of(self, method: str | All) -> pd.DataFrame:
         return self.select(method=method, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
-
-
-DISCARD = "Choose another --out. To discard the results, delete run.json and rows.parquet: trained avatars are kept."
-"""Remedy in the error for rows that would be lost."""
-
-
-def replace_rows(path: Path, rows: Rows) -> None:
-    """Replace the rows of a file. Raises `InputError` and leaves the file unchanged if it has values that
-    they lack."""
-    earlier = earlier_rows(path)
-    lost = [] if earlier is None else rows.values_lacking(earlier)
-    if lost:
-        expected = "new rows with a value for each one in this file"
-        found = f"{len(lost)} without, such as {lost[0]}"
-        raise InputError(path, "", expected, found, f"The file is left unchanged. {DISCARD}")
-    rows.write(path)
-
-
-def earlier_rows(path: Path) -> Rows | None:
-    """The rows that will be replaced; None if there are none. A warning is logged for a damaged file."""
-    if not path.exists():
-        return None
-    try:
-        return Rows.read(path)
-    except InputError as error:
-        if not is_damage(error):
-            raise
-        log.warning("%s It is written again.", error)
-        return None
 
 
 def _read_table(path: Path) -> pa.Table:

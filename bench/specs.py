@@ -332,7 +332,7 @@ class DatasetSpec:
     a keyword ``progress`` is given a `Progress`; one with a keyword ``use_cache`` is given False to read the bytes
     of every file, ignoring its cache. ``reads`` is False for an entry that makes captures instead: its function takes
     ``out`` and settings and writes a capture that another reader reads. Settings whose annotation admits a `Path` name
-    files; a run that was moved together with these files still finds them.
+    files; a run records their absolute paths.
     ``listing`` names a function ``path -> {split: [(timestep, camera), ...]}``: all frames, in the order of the
     capture's own files, by which official repositories number their renders; "" for none.
     ``pose_files`` names a function ``path -> {timestep: file}``: the file with the tracking parameters of each timestep;
@@ -367,8 +367,8 @@ class ConditionSpec:
         "clip": ``implementation`` names a function ``(clip, config, **parameters) -> clip``, where ``config`` is the
         `RunConfig`; it stores results of slow steps in ``config.out``.
         "derive": a function ``(method spec, avatar folder, folder to write, clip, device, **parameters) -> Avatar``.
-        "drive": a function ``(job, avatar, progress, **parameters) -> (Rows, details, files)`` that writes below the run
-        folder. Details are JSON values; the rows are kept only as long as the files are unchanged.
+        "drive": a function ``(job, avatar, progress, **parameters) -> (Rows, details)`` that writes below the run folder.
+        Details are JSON values.
         "views": a function ``(avatar, clip, key, background, **parameters) -> (camera, pose)`` of a scored frame, whose
         picture it can read; the values are not comparable with those of tracked views.
     implementation : str
@@ -390,10 +390,10 @@ class ConditionSpec:
 
 @dataclass(frozen=True)
 class ReportSpec:
-    """A view of stored results: ``implementation`` names a function ``(run_folder) -> files written``.
+    """A view of results: ``implementation`` names a function ``(run) -> files written`` of a `FinishedRun`.
 
     Every such report is written at the end of a run. ``writes`` is False for one that returns text for printing
-    instead, ``(run_folders, format, ...) -> text``.
+    instead, ``(runs, format, ...) -> text`` of run folders or finished runs.
     """
 
     name: str

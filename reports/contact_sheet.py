@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray, FrameKey
+from ..bench.engine.store import FinishedRun
 from ..bench.errors import InputError
 from ..bench.protocol import TASK_TITLES, evenly
 from .drawing import SheetSection, Tile, TileRow, colour_map, write_sheet
@@ -21,9 +22,9 @@ PANEL_WIDTH = 240
 NICE_SCALES = (2, 5, 10, 20, 50, 100, 255)
 
 
-def write_contact_sheet(run_folder: Path, frames_per_task: int = FRAMES_PER_TASK) -> list[Path]:
+def write_contact_sheet(run: Path | FinishedRun, frames_per_task: int = FRAMES_PER_TASK) -> list[Path]:
     """Draw some frames of each task, evenly spaced over its sorted keys; return the file written."""
-    data = RunData.read(run_folder)
+    data = RunData.read(run)
     frames = [
         compared_frame(data, task, key, data.methods)
         for task in data.tasks

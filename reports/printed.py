@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
-from ..bench.errors import InputError
+from ..bench.errors import HeadbenchError, InputError
 from ..bench.manifest import MethodRecord
 from ..bench.protocol import TASK_TITLES
-from ..bench.registry import discover
+from ..bench.registry import get
 from ..bench.specs import MetricSpec
 from .papers import OF_AVATARS, OF_FRAMES, TASKS, PrintedRow, PrintedTable, paper_named
 from .runs import RunSet
@@ -75,8 +76,10 @@ def _metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
     found = []
     for metric, of_frames in used.items():
         label, unit, higher = (OF_FRAMES if of_frames else OF_AVATARS)[metric]
-        plugin = discover("metrics").get(metric)
-        spec = known.get(metric) or (plugin.spec if plugin is not None else None)
+        spec = known.get(metric)
+        if spec is None:
+            with suppress(HeadbenchError):  # no installed metric
+                spec = get("metrics", metric)
         spec = spec or MetricSpec(metric, label, unit, higher, 0, "", kind="frame" if of_frames else "avatar")
         found.append(replace(spec, digits=printed.decimals(metric)))
     return found

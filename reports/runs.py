@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import product
 from operator import attrgetter
@@ -15,7 +15,7 @@ from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.engine.captures import open_run_clips
 from ..bench.engine.config import RunOptions
 from ..bench.engine.scoring import FULL
-from ..bench.engine.store import RunFolder
+from ..bench.engine.store import FinishedRun, RunFolder
 from ..bench.errors import InputError
 from ..bench.manifest import ClipRecord, Manifest, MethodRecord, cut_of
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, joined_protocol, missing_tasks
@@ -40,11 +40,14 @@ class RunData:
     folder: RunFolder
     manifest: Manifest
     rows: Rows
+    clips: Mapping[str, Clip] | None = field(default=None, repr=False, compare=False)
 
     @classmethod
-    def read(cls, root: Path) -> RunData:
-        """Read a run folder. Raises `InputError` naming what is missing or malformed."""
-        folder = RunFolder(root)
+    def read(cls, run: Path | FinishedRun) -> RunData:
+        """Read a run folder, unless the run is in memory. Raises `InputError` naming what is missing or malformed."""
+        if isinstance(run, FinishedRun):
+            return cls(run.folder, run.manifest, run.rows.labelled(), run.clips)
+        folder = RunFolder(run)
         manifest = folder.read_manifest()
         return cls(folder, manifest, folder.read_rows(manifest))
 
@@ -140,8 +143,9 @@ class RunData:
         return dict(zip(places, shown["value"].astype(float)))
 
     @cached_property
-    def _clips(self) -> dict[str, Clip]:
-        # The run itself draws pictures, in the process that loaded its plug-ins.
+    def _clips(self) -> Mapping[str, Clip]:
+        if self.clips is not None:
+            return self.clips
         config, opened = open_run_clips(self.folder.root, RunOptions(trust=True))
         clips = {clip.subject: clip for clip in opened}
         for entry in self.manifest.clips:
@@ -199,7 +203,7 @@ class RunSet:
     averaged: str = AVERAGED
 
     @classmethod
-    def read(cls, folders: Sequence[Path], part: FrameSelection = WHOLE) -> RunSet:
+    def read(cls, folders: Sequence[Path | FinishedRun], part: FrameSelection = WHOLE) -> RunSet:
         """Read runs, or a part of their frames.
 
         Runs of other subjects are joined: their protocols may differ in clips alone. Seeds and subjects of the same method

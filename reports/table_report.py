@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import pandas as pd
 
+from ..bench.engine.store import FinishedRun
 from ..bench.errors import InputError
 from ..bench.io.files import write_text
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
@@ -118,9 +119,9 @@ ALL_COLUMNS = Columns()
 COMPARISON = "comparison"
 
 
-def write_tables(run_folder: Path) -> list[Path]:
+def write_tables(run: Path | FinishedRun) -> list[Path]:
     """Write every table for a run's metrics, in every format, into its folder of tables; return the files."""
-    runs = RunSet.read([run_folder])
+    runs = RunSet.read([run])
     files = []
     for layout in layouts(runs):
         table = table_of(runs, layout)
@@ -132,7 +133,7 @@ def write_tables(run_folder: Path) -> list[Path]:
 
 
 def table_text(
-    run_folders: Sequence[Path],
+    run_folders: Sequence[Path | FinishedRun],
     format: str = "text",
     layout: str = COMPARISON,
     *,
@@ -155,7 +156,7 @@ def written(tables: Iterable[Table], format: str, *, details: bool = False, fit:
 
 
 def tables_of(
-    run_folders: Sequence[Path],
+    run_folders: Sequence[Path | FinishedRun],
     format: str,
     layout: str = COMPARISON,
     paper: str | None = None,
@@ -184,7 +185,7 @@ def tables_of(
             raise InputError("command line", "--table", "--as PAPER beside it", "no paper")
         known = layouts(runs)
         if layout not in known:
-            raise InputError(run_folders[0], "layout", f"one of {', '.join(known)}", repr(layout))
+            raise InputError(runs.runs[0].folder.root, "layout", f"one of {', '.join(known)}", repr(layout))
         return [table_of(runs, layout, Columns(columns, digits))]
     if columns or digits or layout != COMPARISON:
         expected = "no --layout, --columns or --digits beside it: a printed table has its own"

@@ -26,25 +26,21 @@ from ..contracts import (
     no_progress,
 )
 from ..engine.captures import capture_configuration, open_clips, open_run_clips
+from ..engine.cell import measure, render
 from ..engine.config import ResolvedMethod, RunConfig, RunOptions, default_names, resolve_metrics
-from ..engine.job import DIGESTS, Job
-from ..engine.measuring import measure
-from ..engine.rendering import render
-from ..engine.run import run_locked
-from ..engine.store import Cell, RunFolder
+from ..engine.plan import Job
+from ..engine.run import run
+from ..engine.store import Cell
 from ..engine.stored import avatar_digest, open_avatar
 from ..errors import HeadbenchError, InputError
 from ..executors.remote import run_as_task
 from ..io.files import (
     atomic_path,
-    check_kind,
     check_name,
-    check_output_folder,
     digest,
     digest_file,
 )
 from ..io.images import probe_image, read_pixels, read_png, write_png
-from ..io.lock import locked
 from ..named_protocol import check_capture, needed
 from ..protocol import Protocol, make_protocols
 from ..registry import discover, get, resolve
@@ -195,25 +191,25 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
             for (task, key), render in sorted(images.items())
         ]
         method = images_method(config.methods[0], digest(digests)[:12])
-    folder = RunFolder(Path(config.out))
-    check_kind(folder.root, "a run")
-    check_output_folder(folder.root)
 
     def score(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
         if settings.avatar:
             render(job, avatar)
         else:
             _copy(images, job)
-            job.cell.finish(DIGESTS, job.fit_fingerprint, files=job.cell.digests(job.frame_paths))
         return measure(job, avatar, metrics)
 
-    with locked(folder.root):
-        cells = [(method, PLAIN)]
-        rows = run_locked(config, cells=cells, metrics=metrics, clips=clips, each=score, unchecked=True)
-    together = [*([Path(settings.like)] if settings.like else []), folder.root]
+    cells = [(method, PLAIN)]
+    finished = run(config, cells=cells, metrics=metrics, clips=clips, each=score, unchecked=True)
+    together = [*([Path(settings.like)] if settings.like else []), finished]
     text = resolve(get("reports", "table-text").implementation)(together, fit=True)
-    data = {"out": folder.root, "method": method.spec.name, "version": method.spec.version, "rows": len(rows)}
-    return CommandResult(f"{text}\n{folder.root}", data, not rows.failed)
+    data = {
+        "out": finished.folder.root,
+        "method": method.spec.name,
+        "version": method.spec.version,
+        "rows": len(finished.rows),
+    }
+    return CommandResult(f"{text}\n{finished.folder.root}", data, not finished.rows.failed)
 
 
 def _open(settings: EvaluateSettings, label: str, heads: Mapping[str, str]) -> tuple[RunConfig, list[Clip]]:
@@ -222,13 +218,6 @@ def _open(settings: EvaluateSettings, label: str, heads: Mapping[str, str]) -> t
     if settings.label in discover("methods"):
         expected = "a name that no registered method has"
         raise InputError("command line", "--label", expected, repr(label), f"For example {label}-official.")
-    folder = RunFolder(Path(settings.out))
-    held = (
-        [method.label for method in folder.read_manifest().methods] if folder.manifest.exists() else [label]
-    )
-    if held != [label]:
-        expected, found = f"a new folder, or one with {label} alone", f"a run of {', '.join(held)}"
-        raise InputError("command line", "--out", expected, found, "Its results would be lost.")
     if settings.like is not None:
         options = RunOptions(data=settings.clip, head=settings.head, trust=settings.trust)
         config, clips = open_run_clips(

@@ -14,11 +14,9 @@ import pandas as pd
 from ..condition import Condition, Named
 from ..contracts import Progress, no_progress
 from ..engine.captures import open_run_clips
+from ..engine.cell import measure, render
 from ..engine.config import CODED_VARIANT, resolve_cells, resolve_metrics
-from ..engine.job import Job, recorded_frames, trained_files
-from ..engine.jobs import load, make_jobs
-from ..engine.measuring import measure
-from ..engine.rendering import render
+from ..engine.plan import Job, make_jobs
 from ..engine.store import Cell, RunFolder
 from ..errors import ExitCode, InputError
 from ..io.images import read_png
@@ -38,10 +36,9 @@ LEVELS = 1
 
 @dataclass
 class Findings:
-    """Differences between a run and its record, the numbers of files and values compared, and reasons why items were not, by name."""
+    """Differences between a run and its record, the number of values compared, and reasons why items were not, by name."""
 
     mismatches: list[str] = field(default_factory=list)
-    files: int = 0
     values: int = 0
     unverified: dict[str, str] = field(default_factory=dict)
 
@@ -52,7 +49,7 @@ class Findings:
     def text(self, name: str) -> str:
         """The findings in words."""
         count = len(self.mismatches)
-        compared = f"{counted(self.files, 'file')} and {counted(self.values, 'value')}"
+        compared = counted(self.values, "value")
         wrong = "1 mismatch" if count == 1 else f"{count} mismatches"
         verdict = f"{wrong}: {compared} compared" if count else f"{compared} as recorded"
         lines = [f"{name}: {verdict}.", *(f"  {mismatch}" for mismatch in self.mismatches[:SHOWN])]
@@ -86,7 +83,7 @@ def verify_runs(settings: VerifySettings, progress: Progress = no_progress) -> C
 
 
 def verify(run: Path, settings: VerifySettings, progress: Progress = no_progress) -> Findings:
-    """Compare captures, protocols, files and values of a run with its record.
+    """Compare captures, protocols, avatars and values of a run with its record.
 
     Raises `InputError` if it is not a finished run of stored frames, or its capture cannot be opened.
     """
@@ -139,18 +136,16 @@ def _verify_cell(
         return
     # Methods read coded variants like their own avatars, others not.
     stored = bool(job.method.spec.implementation) and job.condition.derive in (Named(), CODED_VARIANT)
-    state, frames = job.cell.step("fit"), recorded_frames(job)
-    if job.method.spec.implementation and (state is None or state["fingerprint"] != job.fit_fingerprint):
-        there = "none" if state is None else "one of other settings, data or version"
-        found.differ(job.cell.folder / "fit.json", f"the avatar of {job.name}", there)
-    unknown = dict.fromkeys({*map(job.cell.name, job.frame_paths)} - {*frames}, "")
-    files = {**(trained_files(job) if stored else {}), **frames, **unknown}
-    found.files += len(files)
-    for file, why in job.cell.damage(files).items():
-        found.differ(job.cell.folder / file, "the file that was written", f"one that {why}")
-    if not all(_can_be_scored(job, path) for path in job.frame_paths):
+    made_from = job.cell.record.get("fingerprint")
+    if job.method.spec.implementation and made_from != job.fit_fingerprint:
+        there = "none" if made_from is None else "one of other settings, data or version"
+        found.differ(job.cell.file, f"the avatar of {job.name}", there)
+    unreadable = [path for path in job.frame_paths if not _can_be_scored(job, path)]
+    for path in unreadable:
+        found.differ(path, "a frame of its size", "one that is damaged" if path.exists() else "no such file")
+    if unreadable:
         return
-    avatar = load(job) if stored else NoAvatar()
+    avatar = job.load() if stored else NoAvatar()
     again = []
     for metric in metrics:
         if metric.per_frame or (stored and metric.kind != "training" and not metric.machine_bound):

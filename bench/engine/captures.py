@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
@@ -21,7 +21,6 @@ from ..specs import LABEL, DatasetSpec, ResolutionRule, is_label
 from .adaptation import MethodNeeds, apply, plan
 from .config import RunConfig, RunOptions, resolve_change
 from .store import RunFolder
-from .trust import check_trusted, names_of
 
 log = logging.getLogger(__name__)
 Plugins = Literal["methods", "metrics"]
@@ -102,14 +101,13 @@ def reader_of(root: str) -> str:
 
     Raises `InputError` if several other readers find one.
     """
-    there = Path(root).exists()
-    found = [name for name, spec in readers().items() if there and finds(spec, Path(root))]
-    if "ga" in found or not found:
+    if not Path(root).exists() or finds(get("datasets", "ga"), Path(root)):
         return "ga"
+    found = [name for name, spec in readers().items() if finds(spec, Path(root))]
     if len(found) > 1:
         expected = "a capture that one reader knows"
         raise InputError(root, "", expected, f"one for {', '.join(found)}", "Choose with the setting reader.")
-    return found[0]
+    return found[0] if found else "ga"
 
 
 def capture_configuration(
@@ -157,23 +155,99 @@ def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dic
     return {**arguments, **found, "only": subject}
 
 
-def relative_paths(config: RunConfig) -> dict[str, str]:
-    """Files and folders that settings name, by dotted key, relative to the run folder: both can be moved together."""
-    root = Path(config.out).resolve()
-    named = {key: Path(value).resolve() for key, value in _named(config).items()}
-    return {key: Path(os.path.relpath(path, root)).as_posix() for key, path in named.items()}
+def located(config: RunConfig, **places: str | None) -> RunConfig:
+    """The settings with absolute paths, so that their files are found from any directory; ``places`` replaces some by key."""
+    paths = {key: os.path.abspath(value) for key, value in _named(config).items()}
+    paths |= {key: place for key, place in places.items() if place is not None}
+    groups: dict[str, dict[str, Any]] = {"reader_settings": {}, "heads": {}, "": {}}
+    for key, path in paths.items():
+        group, _, name = key.partition(".")
+        groups[group if name else ""][name or group] = path
+    settings, heads = ({**getattr(config, name), **groups[name]} for name in ("reader_settings", "heads"))
+    return replace(config, **groups[""], reader_settings=settings, heads=heads)
 
 
-def run_configuration(run: Path, options: RunOptions) -> RunConfig:
+PROGRAMS = "settings"
+"""Key of names of methods that run a program, which their settings name."""
+
+
+def check_trusted(
+    run: Path, named: Mapping[str, Iterable[str]], given: Collection[str] = (), *, trust: bool
+) -> None:
+    """Refuse names by which a run folder, which may be of somebody else, would run code without consent.
+
+    A name with ":" imports a module, a method may run a program.
+
+    Parameters
+    ----------
+    run : Path
+        The file with the names, for messages.
+    named : Mapping[str, Iterable[str]]
+        Names in the file by key of `RunConfig`; those of `PROGRAMS` are methods that run a program.
+    given : Collection[str], optional
+        Names in this command or its configuration file, which are allowed.
+    trust : bool
+        Allow all.
+    """
+    for key, names in named.items() if not trust else ():
+        for name in names:
+            if (":" in name or key == PROGRAMS) and name not in given:
+                allowed = "methods without a program" if key == PROGRAMS else "registered ones"
+                expected = f"names that run no code of others: {allowed}"
+                raise InputError(run, f"configuration.{key}", expected, repr(name), _TRUST)
+
+
+_TRUST = (
+    "If you trust who made the run, name it in this call, or give --trust to a command that has this option."
+)
+
+
+def programs(names: Iterable[str]) -> list[str]:
+    """The methods that run a program, of those with these names."""
+    return [name for name in names if not get("methods", name).native]
+
+
+def _names_of(config: RunConfig) -> dict[str, tuple[str, ...]]:
+    """Names of plug-ins in a configuration by key, for `check_trusted`."""
+    changes = [change.name for c in config.conditions for change in (c.clip, c.derive, c.drive, c.views)]
+    return {
+        "reader": (config.reader,),
+        "conditions": (*changes, config.clip.name),
+        "methods": config.methods,
+        "metrics": config.metrics,
+        "metric_profiles": config.metric_profiles,
+    }
+
+
+def run_configuration(
+    run: Path,
+    options: RunOptions,
+    used: tuple[Plugins, ...] = ("methods", "metrics"),
+    given: Collection[str] = (),
+) -> RunConfig:
     """Settings of a run with the current locations of its folder and files.
+
+    For ``used`` see `open_run_clips`, for ``given`` `check_trusted`.
 
     Raises
     ------
     InputError
         The folder is not a run, plug-ins require `RunOptions.trust`, or a capture or another file is
-        neither at its recorded path relative to the run folder nor at the path in the settings.
+        neither where the run found it nor named by an option.
     """
-    return next(_configurations(run, options))
+    folder = RunFolder(run)
+    config = replace(folder.read_manifest().configuration, out=str(run))
+    unused = [key for group, keys in _KEYS.items() if group not in used for key in keys]
+    named = {key: names for key, names in _names_of(config).items() if key not in unused}
+    check_trusted(folder.manifest, named, given, trust=options.trust)
+    config = located(config, data=options.data, **{"reader_settings.head": options.head})
+    for key, path in _named(config).items():
+        if (
+            key != "source" and not Path(path).exists()
+        ):  # avatars of the source are needed only to derive them again
+            remedy = _REMEDIES.get(key, "Put it there.")
+            raise InputError(folder.manifest, f"configuration.{key}", path, "nothing there", remedy)
+    return config
 
 
 def open_run_clips(
@@ -207,73 +281,20 @@ def open_run_clips(
         A capture's fingerprint differs from the run's, unless ``altered``. Also raised by
         `run_configuration` and `open_clips`.
     """
+    config = run_configuration(run, options, used)
+    config = config if out is None else replace(config, out=str(out))
     recorded = {clip.subject: clip.fingerprint for clip in RunFolder(run).read_manifest().clips}
-    found: list[tuple[RunConfig, list[Clip]]] = []
-    refused: list[InputError] = []
-    for config in _configurations(run, options, used):
-        config = config if out is None else replace(config, out=str(out))
-        try:
-            clips = open_clips(config, use_cache=use_cache)
-        except InputError as error:
-            refused.append(error)
-            continue
-        if all(recorded.get(clip.subject) == clip.fingerprint for clip in clips):
-            return config, clips
-        found.append((config, clips))
-    if not found:
-        raise refused[0]
-    config, clips = found[0]
-    if altered:
-        return config, clips
-    other = next(clip for clip in clips if recorded.get(clip.subject) != clip.fingerprint)
-    raise InputError(
-        config.data,
-        f"subject {other.subject}",
-        f"the capture of the run ({str(recorded.get(other.subject))[:12]})",
-        f"another ({other.fingerprint[:12]})",
-        "Name the folder of the capture with --data, or run again.",
-    )
-
-
-def _configurations(
-    run: Path, options: RunOptions, used: tuple[Plugins, ...] = ("methods", "metrics")
-) -> Iterator[RunConfig]:
-    """The settings of a run for each possible location of its capture. For ``used`` see `open_run_clips`."""
-    folder = RunFolder(run)
-    manifest = folder.read_manifest()
-    config = replace(manifest.configuration, out=str(run))
-    unused = [key for group, keys in _KEYS.items() if group not in used for key in keys]
-    named = {key: names for key, names in names_of(config).items() if key not in unused}
-    check_trusted(folder.manifest, named, trust=options.trust)
-    if options.head is not None:
-        config = replace(config, reader_settings={**config.reader_settings, "head": options.head})
-    given = {"data": options.data, "reader_settings.head": options.head}
-    places: dict[str, list[str]] = {}
-    for key, path in _named(config).items():
-        if given.get(key):
-            places[key] = [str(given[key])]
-            continue
-        relative = (manifest.paths or {}).get(key)
-        beside = [] if relative is None else [os.path.normpath(run.resolve() / relative)]
-        tried = [*beside, path]
-        places[key] = [place for place in tried if Path(place).exists()]
-        if (
-            not places[key] and key == "source"
-        ):  # needed to derive avatars again, not to read what was measured
-            places[key] = [path]
-        if not places[key]:
-            remedy = _REMEDIES.get(key, "Put it there.")
-            raise InputError(
-                folder.manifest, f"configuration.{key}", f"{' or '.join(tried)}", "neither there", remedy
-            )
-    settings, heads = dict(config.reader_settings), dict(config.heads)
-    for key, (place, *_) in places.items():
-        group, _, name = key.partition(".")
-        if name:
-            {"reader_settings": settings, "heads": heads}[group][name] = place
-    source = places["source"][0] if "source" in places else ""
-    for place in places["data"]:
-        yield replace(config, data=place, reader_settings=settings, heads=heads, source=source)
+    clips = open_clips(config, use_cache=use_cache)
+    other = next((clip for clip in clips if recorded.get(clip.subject) != clip.fingerprint), None)
+    if other is not None and not altered:
+        raise InputError(
+            config.data,
+            f"subject {other.subject}",
+            f"the capture of the run ({str(recorded.get(other.subject))[:12]})",
+            f"another ({other.fingerprint[:12]})",
+            "Name the folder of the capture with --data, or run again.",
+        )
+    return config, clips
 
 
 _KEYS: dict[Plugins, tuple[str, ...]] = {"methods": ("methods",), "metrics": ("metrics", "metric_profiles")}

@@ -81,7 +81,7 @@ class RunConfig:
         Registered change of every capture, including the scored frames, such as other held-out
         frames.
     source : str
-        Folder of a finished run whose avatars are used instead of training; "" trains.
+        Folder of a finished run whose avatars, trained under the same conditions, are used instead of training; "" trains.
     """
 
     data: str
@@ -117,10 +117,8 @@ class RunConfig:
                 expected = "the plain comparison beside it, or a source that names their run"
                 raise ValueError(f"conditions: {condition.name} uses trained avatars; {expected}")
             trains = condition.settings or condition.clip or condition.changes_budget
-            if trains and (self.source or condition.follows):
-                expected = (
-                    "nothing is trained with a source or for derive and views; derive, drive or views alone"
-                )
+            if trains and condition.follows:
+                expected = "nothing is trained for derive and views; derive or views alone"
                 raise ValueError(f"conditions, {condition.name}: {expected}")
             if condition.drive and condition.views:
                 raise ValueError(f"conditions, {condition.name}: drive or views; found both")
@@ -238,11 +236,16 @@ def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
 
 
 def with_methods(config: RunConfig, names: Collection[str]) -> RunConfig:
-    """Return the configuration restricted to some methods and their settings."""
+    """Return the configuration restricted to some methods, their settings and their conditions."""
     return replace(
         config,
         methods=tuple(asked for asked in config.methods if get("methods", asked).name in names),
         settings={name: values for name, values in config.settings.items() if name in names},
+        conditions=tuple(
+            replace(condition, methods=tuple(name for name in condition.methods if name in names))
+            for condition in config.conditions
+            if not condition.methods or {*condition.methods} & {*names}
+        ),
     )
 
 

@@ -1,13 +1,17 @@
-"""Runs a comparison: checks everything, then fits, renders and measures cell by cell, then reports."""
+"""Runs a comparison: plans it, which checks everything, then works on it cell by cell, then reports.
+
+With the executor ``inline``, cells follow each other in this process. The others have two passes: all cells in parallel, then the
+speed of their avatars, without concurrent jobs that would bias it. The state of a cell is stored in its files; only this process
+writes the files of the run.
+"""
 
 from __future__ import annotations
 
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict, replace
-from itertools import product
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,39 +19,35 @@ from typing import Any
 import numpy as np
 
 from ..condition import Condition, label_of
-from ..contracts import CheckedMethod, Clip
-from ..errors import (
-    HeadbenchError,
-    InputError,
-    LeftOutError,
-    UnavailableError,
-    is_damage,
-    reason_of,
-)
-from ..executors.outcome import outcome_path
-from ..executors.settings import Execution, check_executor
+from ..contracts import Clip
+from ..errors import HeadbenchError, InputError, LeftOutError, UnavailableError, reason_of, shortened
+from ..executors.outcome import read_outcome
+from ..executors.schedule import DAMAGED, Schedule
+from ..executors.settings import Execution, check_executor, is_speed
+from ..executors.task import Task
+from ..executors.worker import FULL_DISK
 from ..io.files import check_kind, check_output_folder
 from ..io.lock import locked
-from ..machine import check_device_answers, machine_record, peak_memory_bytes
-from ..manifest import AdaptedRecord, ClipRecord, Manifest, MethodRecord, ProtocolRecord
-from ..progress import counted, duration, run_progress
-from ..protocol import TASK_TITLES, Protocol, make_protocols, missing_tasks
+from ..live import Position
+from ..machine import check_device, check_device_answers, peak_memory_bytes
+from ..progress import RunProgress, counted, duration, run_progress
+from ..protocol import TASK_TITLES, Protocol, missing_tasks
 from ..registry import discover, get, resolve
-from ..rows import DISCARD, Rows
-from ..specs import ConditionSpec, DatasetSpec, MetricSpec
-from . import adaptation
-from .captures import open_clips, relative_paths
+from ..rows import Rows
+from ..specs import MAX_LABEL, DatasetSpec, MetricSpec
+from .captures import located, open_clips
+from .cell import failed_rows, run_cell, stored_rows
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
-from .job import Job
-from .jobs import make_jobs, run_cell, steps_ahead
-from .measuring import failed_rows
+from .plan import Job, Plan, make_jobs, make_plan
 from .scoring import compared_over_time, make_metric
-from .store import RunFolder
-from .tasks import execute, machine_of
-from .trust import PROGRAMS, check_trusted, names_of, programs
+from .store import FinishedRun, RunFolder
 
 log = logging.getLogger(__name__)
 RunCell = Callable[[Job, Sequence[MetricSpec]], Rows]
+REPORT_EVERY_S, LOG_EVERY_S = 2.0, 10.0
+"""Seconds between progress records of a cell, shown in a terminal, and between lines of its log."""
+UNTRAINED_COST = 0.15
+"""Expected time of a cell without training (baselines, derived avatars), relative to one with training."""
 
 
 def run(
@@ -56,15 +56,19 @@ def run(
     *,
     unchecked: bool = False,
     clips: Sequence[Clip] | None = None,
+    cells: Sequence[tuple[ResolvedMethod, Condition]] | None = None,
+    metrics: Sequence[MetricSpec] | None = None,
+    each: RunCell = run_cell,
+    is_locked: bool = False,
     reports: bool = True,
     **record: Any,
-) -> Rows:
-    """Run the cells of a configuration into ``config.out`` and return the rows of the whole folder.
+) -> FinishedRun:
+    """Run the cells of a configuration into ``config.out``.
 
     Everything that can be checked is checked before the first long step: settings, device, methods, captures,
     the output folder, and that no other process uses it. A method that fails is recorded as failed and the
-    others continue. A restart with the same configuration keeps finished steps and resumes the others. In a
-    folder with other methods, seeds, metrics, conditions or frames it adds the new ones, see `grown`.
+    others continue. The same configuration continues a run: finished cells are kept, interrupted ones resume, failed ones are
+    repeated. Another configuration is refused.
 
     Parameters
     ----------
@@ -75,144 +79,63 @@ def run(
         continued without a search, too.
     clips : Sequence[Clip], optional
         Captures of the configuration, if they are already open.
+    cells, metrics : sequence, optional
+        Resolved cells and metrics, if the configuration does not name them; they require ``each``.
+    each : callable, optional
+        Executes a cell in this process.
+    is_locked : bool
+        Whether the caller has locked the folder.
     reports : bool
         Write the registered reports at the end.
     record : Any
         Values to add to the manifest.
-    """
-    check_kind(Path(config.out), "a run")
-    check_output_folder(Path(config.out))
-    with locked(Path(config.out)):
-        return run_locked(config, execution, unchecked=unchecked, clips=clips, reports=reports, **record)
 
-
-def run_locked(
-    config: RunConfig,
-    execution: Execution | None = None,
-    *,
-    unchecked: bool = False,
-    clips: Sequence[Clip] | None = None,
-    cells: Sequence[tuple[ResolvedMethod, Condition]] | None = None,
-    metrics: Sequence[MetricSpec] | None = None,
-    each: RunCell | None = None,
-    trust: bool = False,
-    reports: bool = True,
-    **record: Any,
-) -> Rows:
-    """Run the cells of a configuration like `run`, in a folder that the caller has locked.
-
-    Parameters
-    ----------
-    cells, metrics : sequence, optional
-        Resolved cells and metrics, if the configuration does not name them; they require ``each``.
-    each : callable, optional
-        Executes a cell in this process, instead of `run_cell`.
-    trust : bool
-        Import modules and run programs that only a run in the folder names.
+    Raises
+    ------
+    OSError
+        The disk is full or read-only; finished cells are kept.
     """
     start = time.perf_counter()
-    folder = RunFolder(Path(config.out))
-    config = grown(config, folder, trust=trust) if cells is None else config
-    cells = resolve_cells(config) if cells is None else cells
-    metrics = resolve_metrics(config) if metrics is None else metrics
-    execution = execution or Execution()
-    check_executor(execution, config.device)
-    rows = _run(config, cells, metrics, folder, execution, clips, each or run_cell, unchecked, record)
-    if reports:
-        log.info("writing tables, pictures and the report")
-        write_reports(folder.root)  # after the captures were freed
-    log.info("finished in %s: %s", duration(time.perf_counter() - start), folder.root)
-    return rows
-
-
-def _run(
-    config: RunConfig,
-    cells: Sequence[tuple[ResolvedMethod, Condition]],
-    metrics: Sequence[MetricSpec],
-    folder: RunFolder,
-    execution: Execution,
-    clips: Sequence[Clip] | None,
-    each: RunCell,
-    unchecked: bool,
-    record: Mapping[str, Any],
-) -> Rows:
-    start = time.perf_counter()
-    clips = open_clips(config) if clips is None else clips
-    planned, protocols, jobs = _planned(config, cells, metrics, folder, clips)
-    known: set[str] = set()
-    with suppress(InputError):  # of a new run, or of one whose record is damaged
-        earlier = folder.read_manifest()
-        known = {clip.fingerprint for clip in earlier.clips}
-        if earlier.unchecked and not unchecked:
-            unchecked = True
-            log.warning("The captures are not searched for errors, as this run was begun with --unchecked.")
-    if not config.drive:
-        warn_of_missing_metrics(metrics, clips[0])
-    if not unchecked and not config.source:
-        for clip in {job.clip.subject: job.clip for job in jobs if not job.cell.ended("fit")}.values():
-            if clip.fingerprint not in known:
-                check_capture(config, clip)
-
-    forms = tuple(
-        AdaptedRecord(**adaptation.record(job.clip, job.adapted, job.label))
-        for job in jobs
-        if job.adapted is not None and job.seed == config.seeds[0]
-    )
-    manifest = replace(planned, adapted=forms, unchecked=unchecked or None, **record)
-    manifest.write(folder.manifest)
-    for reason in {} if config.drive else missing_tasks(config.tasks, protocols).values():
-        log.warning("%s", reason)
-    for protocol in protocols.values():
-        log.info("%s: %d frames to score", TASK_TITLES[protocol.task], len(protocol.keys))
-    if execution.executor == "inline":
-        rows = run_jobs(jobs, metrics, each)
-    else:
-        rows = execute(jobs, metrics, folder, execution)
-        manifest = replace(manifest, machine=dict(machine_of(jobs, manifest.machine)))
-    folder.write_rows(rows)
-    folder.speed_pass.unlink(missing_ok=True)
-    seconds = round(time.perf_counter() - start, 3)
-    methods = tuple(replace(method, codec=_codec(method.label, jobs)) for method in manifest.methods)
-    manifest = replace(manifest, methods=methods)
-    done = replace(manifest, status="done", seconds=seconds, peak_memory_bytes=peak_memory_bytes())
-    done.write(folder.manifest)
-    return rows
-
-
-def _codec(label: str, jobs: Sequence[Job]) -> str | None:
-    """Codecs of the measured avatars of a method and condition, see `MethodRecord`."""
-    steps = [job.cell.step("measure") for job in jobs if job.label == label]
-    found = {str(step["codec"]) for step in steps if step is not None and "codec" in step}
-    return "; ".join(sorted(found)) if found else None
-
-
-def _planned(
-    config: RunConfig,
-    cells: Sequence[tuple[ResolvedMethod, Condition]],
-    metrics: Sequence[MetricSpec],
-    folder: RunFolder,
-    clips: Sequence[Clip],
-    out: Path | None = None,
-) -> tuple[Manifest, dict[str, Protocol], list[Job]]:
-    """The record, the protocols and the cells of a run, all checked; ``out`` as for `make_jobs`."""
-    for method, condition in cells:
-        places = product([clip.subject for clip in clips], config.seeds)
-        label = label_of(method.spec.name, condition.name)
-        if not all(folder.cell(s, label, seed).ended("measure") for s, seed in places):
-            check_settings([(method, condition)])
-    if config.drive:
-        driven = make_jobs(config, cells, clips, {}, folder, out)
-        spec: ConditionSpec = get("conditions", config.drive.name)
-        protocols: dict[str, Protocol] = resolve(spec.protocols)(driven, **config.drive.parameters)
-    else:
-        protocols = make_protocols(config.tasks, clips, config.frames_per_task)
-    planned = describe(config, cells, metrics, clips, protocols)
-    folder.check_kept(planned)
-    jobs = make_jobs(config, cells, clips, protocols, folder, out)
-    for job in jobs:
-        job.check()
-        job.check_method()
-    return planned, protocols, jobs
+    config, execution = located(config), execution or Execution()
+    root = Path(config.out)
+    check_kind(root, "a run")
+    check_output_folder(root)
+    with nullcontext() if is_locked else locked(root):
+        check_executor(execution, config.device)
+        plan = make_plan(config, clips, cells, metrics)
+        folder, jobs, metrics = plan.folder, plan.jobs, plan.metrics
+        unchecked = _check_captures(plan, unchecked)
+        manifest = replace(plan.manifest, unchecked=unchecked or None, **record)
+        manifest.write(folder.manifest)
+        parts = []
+        if execution.executor == "inline":
+            with run_progress({job.name: job.steps(metrics) for job in jobs}) as line:
+                for job in jobs:
+                    log.info("%s", job.name)
+                    if read_outcome(job.cell.folder):  # of an earlier process or job
+                        job.cell.update(task=None)
+                    try:
+                        parts.append(each(replace(job, line=line), metrics))
+                    except Exception as error:  # noqa: BLE001 - a method may fail in any way; the others go on
+                        _check_goes_on(job, error)
+                        parts.append(failed_rows(job, metrics, reason_of(error)))
+                    job.created.clear()  # so that a run does not keep every method in memory
+        else:
+            parts = execute(plan, execution)
+            manifest = replace(manifest, machine=dict(_machine_of(jobs, manifest.machine)))
+        rows = Rows.joined(parts)
+        rows.write(folder.rows)
+        seconds = round(time.perf_counter() - start, 3)
+        methods = tuple(replace(method, codec=_codec(method.label, jobs)) for method in manifest.methods)
+        manifest = replace(manifest, methods=methods, status="done", seconds=seconds)
+        manifest = replace(manifest, peak_memory_bytes=peak_memory_bytes())
+        manifest.write(folder.manifest)
+        finished = FinishedRun(folder, manifest, rows, {clip.subject: clip for clip in plan.clips})
+        if reports:
+            log.info("writing tables, pictures and the report")
+            write_reports(finished)
+        log.info("finished in %s: %s", duration(time.perf_counter() - start), root)
+        return finished
 
 
 def planned_cells(config: RunConfig) -> dict[str, str]:
@@ -220,105 +143,52 @@ def planned_cells(config: RunConfig) -> dict[str, str]:
 
     Nothing is written into ``config.out``.
     """
-    folder = RunFolder(Path(config.out))
-    config = grown(config, folder)
     with TemporaryDirectory() as scratch:
-        clips = open_clips(replace(config, out=scratch))
-        metrics = resolve_metrics(config)
-        forms = replace(config, out=scratch)
-        jobs = _planned(forms, resolve_cells(config), metrics, folder, clips, Path(scratch))[2]
-    return {job.name: _state(job) for job in jobs}
+        plan = make_plan(located(config), scratch=Path(scratch))
+    return {job.name: _state(job, plan.metrics) for job in plan.jobs}
 
 
-def _state(job: Job) -> str:
-    if not job.cell.is_done("fit", job.fit_fingerprint):
+def _state(job: Job, metrics: Sequence[MetricSpec]) -> str:
+    if not job.cell.is_trained:
         return "to train" if job.source is None else "to derive"
-    return "done" if job.cell.ended("measure") else "trained"
+    return "done" if job.is_measured(metrics) else "trained"
 
 
-def grown(config: RunConfig, folder: RunFolder, *, trust: bool = False) -> RunConfig:
-    """The configuration extended by methods, seeds, tasks, metrics, conditions of the run in the folder.
-
-    Raises `InputError` if a setting that determines the results of all cells differs.
-    """
-    if not folder.rows.is_file() or not folder.manifest.is_file():
-        return config
-    try:
-        earlier = folder.read_manifest().configuration
-    except InputError as error:
-        if not is_damage(error):
-            raise
-        log.warning("%s It is written again.", error)
-        return config  # rows that would be lost are an error when they are written
-    _check_additions(earlier, config, folder.manifest, trust=trust)
-    before = product(earlier.methods, earlier.seeds)
-    asked = product(config.methods, config.seeds)
-    every = product({*earlier.methods, *config.methods}, {*earlier.seeds, *config.seeds})
-    if more := sorted({*every} - {*before} - {*asked}):
-        text = ", ".join(f"{method} seed {seed}" for method, seed in more)
-        log.warning("A run has every method with every seed; this one gets %s, too.", text)
-    source = (folder.read_manifest().paths or {}).get("source")
-    places = [earlier.source, *([] if source is None else [str(folder.root / source)])]
-    for name in ("preset", "device", "divide", "clip", "source", "drive"):
-        then, now = getattr(earlier, name), getattr(config, name)
-        if then != now and not (name == "source" and any(_same_place(place, now) for place in places)):
-            raise InputError(
-                folder.manifest, f"configuration.{name}", f"{then}, as in this run", str(now), DISCARD
-            )
-    union: dict[str, Any] = {
-        name: tuple(dict.fromkeys((*getattr(earlier, name), *getattr(config, name))))
-        for name in ("methods", "seeds", "tasks", "metrics", "metric_profiles")
-    }
-    named = {condition.name: condition for condition in (*earlier.conditions, *config.conditions)}
-    for condition in config.conditions:
-        before_methods = {c.name: c.methods for c in earlier.conditions}.get(condition.name)
-        if before_methods is not None:
-            both = () if () in (before_methods, condition.methods) else (*before_methods, *condition.methods)
-            named[condition.name] = replace(condition, methods=tuple(dict.fromkeys(both)))
-    # Methods named in this call use the settings of this call, which may contain programs.
-    asked_names = {get("methods", name).name for name in config.methods}
-    others = {name: values for name, values in earlier.settings.items() if name not in asked_names}
-    frames = (earlier.frames_per_task, config.frames_per_task)
-    return replace(
-        config,
-        **union,
-        conditions=tuple(named.values()),
-        settings={**others, **config.settings},
-        frames_per_task=None if None in frames else max(frames),  # type: ignore[type-var]
-    )
+def _check_captures(plan: Plan, unchecked: bool) -> bool:
+    """Warn of what cannot be measured, and check the captures of a new run; return whether they are unchecked."""
+    if plan.earlier is not None:
+        unchecked = unchecked or bool(plan.earlier.unchecked)
+    elif not unchecked and not plan.config.source:
+        for clip in {job.clip.subject: job.clip for job in plan.jobs}.values():
+            check_capture(plan.config, clip)
+    if not plan.config.drive:
+        warn_of_missing_metrics(plan.metrics, plan.clips[0])
+        for reason in missing_tasks(plan.config.tasks, plan.protocols).values():
+            log.warning("%s", reason)
+    for protocol in plan.protocols.values():
+        log.info("%s: %d frames to score", TASK_TITLES[protocol.task], len(protocol.keys))
+    return unchecked
 
 
-def _check_additions(earlier: RunConfig, config: RunConfig, manifest: Path, *, trust: bool) -> None:
-    """Apply `check_trusted` to what only the run in the folder names."""
-    known = {condition.name for condition in config.conditions}
-    others = [condition for condition in earlier.conditions if condition.name not in known]
-    named, given = names_of(earlier, others), names_of(config)
-    del named["reader"]  # that of this call is used
-    check_trusted(manifest, named, given, trust=trust)
-    # Settings of a condition may name another program of a method in this call.
-    more = config.methods if any(condition.settings for condition in others) else ()
-    added = [name for name in earlier.methods if name not in config.methods]
-    check_trusted(manifest, {PROGRAMS: programs([*added, *more])}, trust=trust)
+def _check_goes_on(job: Job, error: Exception) -> None:
+    """Log the failure of a cell. Raises the error if it would affect every other cell."""
+    if isinstance(error, OSError) and error.errno in FULL_DISK:
+        raise error
+    if isinstance(error, HeadbenchError):
+        log.error("%s failed: %s", job.name, error)
+        return
+    log.error("%s failed", job.name, exc_info=error)
+    check_device_answers(job.device)
 
 
-def _same_place(first: str, second: str) -> bool:
-    return bool(first and second) and Path(first).resolve() == Path(second).resolve()
+def _codec(label: str, jobs: Sequence[Job]) -> str | None:
+    """Codecs of the measured avatars of a method and condition, see `MethodRecord`."""
+    records = [job.cell.record for job in jobs if job.label == label]
+    found = {record["codec"] for record in records if "codec" in record}
+    return "; ".join(sorted(found)) if found else None
 
 
-def check_settings(cells: Iterable[tuple[ResolvedMethod, Condition]]) -> None:
-    """Create the method of each cell, so that its settings are checked before any long step.
-
-    Raises `InputError` for settings that a method refuses, and whatever importing or creating it raises.
-    """
-    for method, _ in cells:
-        if not method.spec.implementation:
-            continue  # a folder of images
-        made = method.create()
-        if isinstance(made, CheckedMethod):
-            made.check(None, method.budget)
-
-
-def write_reports(run_folder: Path) -> list[Path]:
+def write_reports(run: FinishedRun) -> list[Path]:
     """Write every registered report of a finished run. One that fails is logged and the others are written."""
     written: list[Path] = []
     for name, plugin in discover("reports").items():
@@ -326,34 +196,12 @@ def write_reports(run_folder: Path) -> list[Path]:
             log.warning("report %r of %s is broken: %s", name, plugin.origin, plugin.error)
         elif plugin.spec.writes:
             try:
-                written += resolve(plugin.spec.implementation)(run_folder)
+                written += resolve(plugin.spec.implementation)(run)
             except (HeadbenchError, OSError) as error:
                 log.error("report %r of %s failed: %s; the rows are complete", name, plugin.origin, error)
             except Exception:
                 log.exception("report %r of %s failed; the rows are complete", name, plugin.origin)
     return written
-
-
-def run_jobs(jobs: Sequence[Job], metrics: Sequence[MetricSpec], each: RunCell) -> Rows:
-    """Execute each cell, with one progress line; a cell that fails has failed rows."""
-    with run_progress({job.name: steps_ahead(job, metrics) for job in jobs}) as line:
-        return Rows.joined([_run_inline(replace(job, line=line), metrics, each) for job in jobs])
-
-
-def _run_inline(job: Job, metrics: Sequence[MetricSpec], each: RunCell) -> Rows:
-    log.info("%s", job.name)
-    outcome_path(job.cell.folder).unlink(missing_ok=True)  # left by an earlier process or job
-    try:
-        return each(job, metrics)
-    except HeadbenchError as error:
-        log.error("%s failed: %s", job.name, error)
-        return failed_rows(job, metrics, reason_of(error))
-    except Exception as error:
-        log.exception("%s failed", job.name)
-        check_device_answers(job.device)
-        return failed_rows(job, metrics, reason_of(error))
-    finally:
-        job.created.clear()  # so that a run does not keep every method in memory
 
 
 def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
@@ -388,32 +236,157 @@ def check_capture(config: RunConfig, clip: Clip) -> None:
         )
 
 
-def describe(
-    config: RunConfig,
-    cells: Sequence[tuple[ResolvedMethod, Condition]],
-    metrics: Sequence[MetricSpec],
-    clips: Sequence[Clip],
-    protocols: Mapping[str, Protocol],
-) -> Manifest:
-    """Create the manifest of a new run."""
-    return Manifest(
-        configuration=config,
-        paths=relative_paths(config),
-        methods=tuple(
-            MethodRecord(**method.record(), condition=condition.name) for method, condition in cells
-        ),
-        metrics=tuple(metrics),
-        clips=tuple(
-            ClipRecord(
-                subject=clip.subject,
-                fingerprint=clip.fingerprint,
-                steps=[asdict(step) for step in clip.steps],
-                splits={name: len(keys) for name, keys in clip.splits.items()},
-                excluded={str(key): reason for key, reason in sorted(clip.excluded.items())},
-                training_cameras=tuple(sorted({key.camera for key in clip.splits.get("train", ())})),
-            )
-            for clip in clips
-        ),
-        protocols={task: ProtocolRecord.of(protocol) for task, protocol in protocols.items()},
-        machine=machine_record(config.device),
+def execute(plan: Plan, execution: Execution) -> list[Rows]:
+    """Execute the cells of a run in workers or as jobs; return the rows of each.
+
+    Measured cells are kept. A cell whose process or job was lost is restarted, at most `Execution.restarts`
+    times. A cell that fails has failed rows.
+    """
+    jobs, metrics = plan.jobs, plan.metrics
+    captures = {subject: index for index, subject in enumerate(dict.fromkeys(j.clip.subject for j in jobs))}
+    tasks = [_task(job, captures[job.clip.subject], plan.folder) for job in jobs]
+    places = {task.place: job for task, job in zip(tasks, jobs)}
+    steady = [metric for metric in metrics if not is_speed(metric)]
+    failures: dict[str, str] = {}
+    schedule = Schedule(
+        "avatars trained and measured", lambda task: places[task.place].is_measured(steady), execution
     )
+    for follows in (False, True):  # derived avatars wait for the training of their source
+        left = [t for t in tasks if places[t.place].follows == follows and not schedule.is_done(t)]
+        failures |= schedule.run_all(left)
+    if len(steady) < len(metrics):
+        speed = Schedule(
+            "speed of avatars measured",
+            lambda task: places[task.place].is_measured(metrics),
+            execution,
+            speed=True,
+        )
+        left = [task for task in tasks if task.place not in failures and not speed.is_done(task)]
+        failures |= speed.run_all([replace(task, speed=True) for task in left])
+    return [_merged(job, metrics, failures.get(place)) for place, job in places.items()]
+
+
+def _merged(job: Job, metrics: Sequence[MetricSpec], failure: str | None) -> Rows:
+    """Rows of a cell that has ended."""
+    if failure is None and job.is_measured(metrics):
+        return stored_rows(job, metrics)
+    return failed_rows(job, metrics, failure or f"HeadbenchError: {DAMAGED}")
+
+
+def _machine_of(jobs: Sequence[Job], otherwise: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The machine that ran the cells; ``otherwise`` if none is recorded; all names if there were several."""
+    outcomes = [read_outcome(job.cell.folder) for job in jobs]
+    machines = [outcome["machine"] for outcome in outcomes if outcome is not None and "machine" in outcome]
+    if not machines:
+        return otherwise
+    record = {**machines[0], "processor": _all_of(str(machine.get("processor")) for machine in machines)}
+    devices = [machine["device"] for machine in machines if "device" in machine]
+    if devices:
+        record["device"] = {**devices[0], "name": _all_of(str(device["name"]) for device in devices)}
+    return record
+
+
+def _all_of(names: Iterable[str]) -> str:
+    """Join distinct names; log a warning if there are several."""
+    different = sorted(set(names))
+    if len(different) > 1:
+        log.warning(
+            "Cells were executed by %s: their times and speeds are not comparable.", ", ".join(different)
+        )
+    return shortened(" and ".join(different), MAX_LABEL - 10)
+
+
+def _task(job: Job, capture: int, folder: RunFolder) -> Task:
+    """The task of a cell of the run in ``folder``; ``capture`` is the index of its subject among the captures found."""
+    place = job.cell.folder.relative_to(folder.root).as_posix()
+    cell = {"subject": job.clip.subject, "label": job.label, "seed": job.seed, "capture": capture}
+    task = Task.of(folder.root, place, f"{__name__}:execute_cell", **cell)
+    trains = job.source is None and not job.method.spec.trivial
+    return replace(task, device=job.device, name=job.name, cost=1.0 if trains else UNTRAINED_COST)
+
+
+def execute_cell(task: Task, report: Callable[[str], None]) -> None:
+    """Run a cell as recorded in its run, without speed metrics unless the task measures speed."""
+    job, metrics = _opened.job(Path(task.root), **task.arguments)
+    reported = logged = time.monotonic()
+
+    def show(position: Callable[[], Position]) -> None:
+        nonlocal reported, logged
+        now = time.monotonic()
+        if now - reported < REPORT_EVERY_S:
+            return
+        reported, words = now, position().text.partition(": ")[2]
+        report(words)
+        if now - logged >= LOG_EVERY_S:
+            logged = now
+            log.info("%s", words)
+
+    job = replace(job, line=RunProgress({job.name: job.steps(metrics)}, show))
+    run_cell(job, metrics if task.speed else [metric for metric in metrics if not is_speed(metric)])
+
+
+class _Opened:
+    """Cache of the last run record and capture, since cells of the same run and subject follow each other."""
+
+    def __init__(self) -> None:
+        self._run: _Run | None = None
+        self._clips: list[Clip] = []
+
+    def job(
+        self, run: Path, subject: str, label: str, seed: int, capture: int
+    ) -> tuple[Job, Sequence[MetricSpec]]:
+        """A cell and the metrics of its run. Raises `InputError` if the capture has changed since the run began."""
+        if self._run is None or self._run.folder.root != run:
+            self._run = _Run.read(run)
+            self._clips = []
+        config, recorded = self._run.config, self._run.fingerprints
+        if [clip.subject for clip in self._clips] != [subject]:
+            self._clips = []  # free the former before reading another
+            self._clips = open_clips(config, only=capture)
+        if {clip.subject: clip.fingerprint for clip in self._clips} != {subject: recorded[subject]}:
+            found = ", ".join(clip.subject for clip in self._clips) or "none"
+            raise InputError(config.data, subject, "the capture that the run began with", found)
+        cells, chosen = [self._run.cells[label]], replace(config, seeds=(seed,))
+        (job,) = make_jobs(chosen, cells, self._clips, self._run.protocols, self._run.folder)
+        return job, self._run.metrics
+
+
+_opened = _Opened()
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A run as recorded."""
+
+    folder: RunFolder
+    config: RunConfig
+    fingerprints: Mapping[str, str]
+    cells: Mapping[str, tuple[ResolvedMethod, Condition]]
+    metrics: Sequence[MetricSpec]
+    protocols: Mapping[str, Protocol]
+
+    @classmethod
+    def read(cls, root: Path) -> _Run:
+        folder = RunFolder(root)
+        manifest = folder.read_manifest()
+        config = replace(manifest.configuration, out=str(root))
+        check_device(config.device)
+        recorded = manifest.protocols.items()
+        protocols = {task: record.protocol(folder.manifest) for task, record in recorded}
+        cells = {
+            label_of(m.spec.name, condition.name): (m, condition) for m, condition in resolve_cells(config)
+        }
+        began_with = {method.label: method.code for method in manifest.methods}
+        for label, (method, _) in cells.items():
+            code = method.identity().get("code")  # for plug-ins outside the package
+            if code not in (None, began_with.get(label)):
+                expected = f"{began_with.get(label)}, the digest of the plug-in's code when the run began"
+                raise InputError(folder.manifest, f"methods, code of {label}", expected, code)
+        return cls(
+            folder,
+            config,
+            {clip.subject: clip.fingerprint for clip in manifest.clips},
+            cells,
+            resolve_metrics(config),
+            protocols,
+        )

@@ -16,7 +16,7 @@ from ..contracts import Avatar, Budget, Clip, FloatArray
 from ..errors import InputError
 from ..io.arrays import MAX_MAGNITUDE, check_numbers
 from ..io.documents import checked, read_json
-from ..io.files import digest, digest_file, entries, write_json
+from ..io.files import digest, digest_file, entries, is_system_file, write_json
 from ..io.provenance import tool
 from ..registry import discover, get, resolve
 from ..specs import MethodSpec, ResolutionRule
@@ -253,8 +253,8 @@ def training_losses(folder: Path) -> list[tuple[int, float]]:
 
 
 def avatar_digest(folder: Path) -> str:
-    """Digest of all files of an avatar; see `avatar_files`."""
-    from .store import avatar_files  # loads pandas, which reading an avatar does without
-
+    """Digest of all files of an avatar, except logs of official programs and files of operating systems."""
     home = avatar_folder(folder)
-    return digest([[path.relative_to(home).as_posix(), digest_file(path)] for path in avatar_files(home)])
+    files = [path for path in home.rglob("*") if path.is_file() and path.suffix != ".log"]
+    files = sorted(path for path in files if not is_system_file(path.name))
+    return digest([[path.relative_to(home).as_posix(), digest_file(path)] for path in files])

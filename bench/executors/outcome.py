@@ -1,4 +1,4 @@
-"""``outcome.json`` of a task: current activity of its process or job, or how it ended."""
+"""Outcome of a task in the ``cell.json`` of its folder: current activity of its process or job, or how it ended."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from typing import Any, Literal, Required
 
 from typing_extensions import TypedDict
 
-from ..errors import InputError
 from ..io.documents import checked, read_json
 from ..io.files import write_json
 
 
 class TaskOutcome(TypedDict, total=False):
-    """Content of ``outcome.json``.
+    """Entry ``task`` of ``cell.json``.
 
     Attributes
     ----------
@@ -51,30 +50,36 @@ class TaskOutcome(TypedDict, total=False):
     machine: dict[str, Any]
 
 
-def outcome_path(task: Path) -> Path:
-    """Path of the outcome of the task in a folder."""
-    return task / "outcome.json"
+def record_path(folder: Path) -> Path:
+    """The record of a cell, or of another task, in its folder."""
+    return folder / "cell.json"
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Read the record of a folder; empty if it is missing."""
+    path = record_path(folder)
+    return read_json(path) if path.exists() else {}
+
+
+def update_record(folder: Path, **changes: Any) -> None:
+    """Write entries of the record atomically; None removes one."""
+    record = {**read_record(folder), **changes}
+    write_json(record_path(folder), {key: value for key, value in record.items() if value is not None})
 
 
 def read_outcome(task: Path) -> TaskOutcome | None:
     """Read the outcome of a task's folder; None if it is missing. Raises `InputError` for a damaged one."""
-    path = outcome_path(task)
-    if not path.exists():
-        return None
-    outcome: TaskOutcome = checked(read_json(path), TaskOutcome, path)
-    return outcome
+    found = read_record(task).get("task")
+    return None if found is None else checked(found, TaskOutcome, record_path(task), "task")
 
 
 def write_outcome(task: Path, outcome: TaskOutcome) -> None:
-    """Write the file atomically."""
-    write_json(outcome_path(task), outcome)
+    """Write the outcome into the record."""
+    update_record(task, task=outcome)
 
 
 def forget_outcome(task: Path, speed: bool) -> None:
     """Remove the outcome of an earlier pass of the same kind, so that a new pass does not read it."""
-    try:
-        outcome = read_outcome(task)
-    except InputError:  # damaged
-        outcome = None
-    if outcome is None or outcome["speed"] == speed:
-        outcome_path(task).unlink(missing_ok=True)
+    outcome = read_outcome(task)
+    if outcome is not None and outcome["speed"] == speed:
+        update_record(task, task=None)

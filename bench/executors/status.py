@@ -125,7 +125,7 @@ def cell_states(folder: RunFolder, manifest: Manifest) -> list[CellState]:
             found.append(_of_outcome(key, cell.folder, outcome, speed, jobs.get(place, ""), queued))
         elif key in failed:
             found.append(CellState(*key, "failed", failed[key]))
-        elif cell.ended("measure"):
+        elif {metric.name for metric in manifest.metrics} <= {*cell.record.get("measured", ())}:
             found.append(CellState(*key, "done"))
         elif queued and place in jobs and jobs[place] in queued:
             found.append(CellState(*key, "waiting", f"job {jobs[place]} is {queued[jobs[place]].shown}"))

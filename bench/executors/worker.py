@@ -27,7 +27,7 @@ FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 def execute_task(task: Task) -> None:
-    """Execute a task. Failures are recorded in ``outcome.json``, with its log in ``job.log``.
+    """Execute a task. Failures are recorded in ``cell.json``, with its log in ``job.log``.
 
     Raises
     ------

@@ -11,11 +11,10 @@ from pathlib import Path
 
 from ..condition import Condition, Named
 from ..contracts import Budget, Clip, Progress, no_progress
-from ..engine.captures import open_run_clips, run_configuration
+from ..engine.captures import PROGRAMS, check_trusted, open_run_clips, run_configuration
 from ..engine.config import ResolvedMethod, resolve_methods, with_methods
-from ..engine.run import run_locked
+from ..engine.run import run
 from ..engine.store import Cell, RunFolder
-from ..engine.trust import PROGRAMS, check_trusted
 from ..errors import InputError
 from ..io.files import check_kind, output_inside, refuse_links
 from ..io.lock import locked
@@ -73,7 +72,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
         refuse_links(out)
         _drop_interrupted(out)
         unchecked = bool(manifest.unchecked)  # for a run whose captures have errors
-        run_locked(config, execution, trust=settings.trust, clips=clips, reports=False, unchecked=unchecked)
+        run(config, execution, clips=clips, is_locked=True, reports=False, unchecked=unchecked)
         found: CommandResult = resolve(get("reports", "curve").implementation)(out, settings.over)
         return found
 
@@ -163,12 +162,8 @@ def _wanted(settings: CurveSettings, source: RunFolder) -> list[ResolvedMethod]:
 
 
 def _drop_interrupted(out: Path) -> None:
-    """Remove files of interrupted trainings, so that they restart and their time can be measured."""
-    for record in sorted(out.glob("*/*/seed-*/fit.json")):
-        cell = Cell(record.parent)
-        state = cell.step("fit")
-        if state is not None and state["status"] != "done":
-            if cell.avatar.exists():
-                log.info("%s: its training was interrupted; it begins again", record.parent)
-                shutil.rmtree(cell.avatar)
-            record.unlink()
+    """Remove interrupted trainings, so that they restart and their time can be measured."""
+    for folder in sorted(out.glob("*/*/seed-*")):
+        if Cell(folder).record.get("state") == "training":
+            log.info("%s: its training was interrupted; it begins again", folder)
+            shutil.rmtree(folder)

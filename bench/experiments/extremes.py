@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import cv2
@@ -13,7 +12,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from ..contracts import Avatar, Clip, DepthAvatar, FloatArray, FrameKey, HeadPose, Progress
-from ..engine.job import Job
+from ..engine.plan import Job
 from ..errors import UnavailableError
 from ..io.files import digest
 from ..protocol import Protocol
@@ -212,19 +211,15 @@ def protocols(jobs: Sequence[Job], **parameters: Any) -> dict[str, Protocol]:
     return protocols_of(TASK, [_shown(job, ExtremesPlan.of(job.form.clip, **parameters)) for job in jobs])
 
 
-def drive(
-    job: Job, avatar: Avatar, progress: Progress, **parameters: Any
-) -> tuple[Rows, dict[str, Any], list[Path]]:
+def drive(job: Job, avatar: Avatar, progress: Progress, **parameters: Any) -> tuple[Rows, dict[str, Any]]:
     """Render and evaluate every frame of the plan; the registered change "extremes".
 
-    The details are the record of the avatar: views, frames, ground truth and results. The files are the frames of the contact
-    sheet and their ground truth.
+    The details are the record of the avatar: views, frames, ground truth and results.
     """
     plan = ExtremesPlan.of(job.form.clip, **parameters)
-    files: list[Path] = []
     keys = _shown(job, plan).keys
-    rows, record = judged_rows(job, keys, lambda: _judged(job, avatar, plan, files, progress))
-    return Rows.of(rows), {"avatars": [record]}, list(dict.fromkeys(files))
+    rows, record = judged_rows(job, keys, lambda: _judged(job, avatar, plan, progress))
+    return Rows.of(rows), {"avatars": [record]}
 
 
 def _shown(job: Job, plan: ExtremesPlan) -> ShownFrames:
@@ -252,7 +247,7 @@ def _key(job: Job, plan: ExtremesPlan, frame: PlannedFrame) -> FrameKey:
 
 
 def _judged(
-    job: Job, avatar: Avatar, plan: ExtremesPlan, files: list[Path], report: Progress
+    job: Job, avatar: Avatar, plan: ExtremesPlan, report: Progress
 ) -> tuple[list[JudgedFrame], dict[str, Any]]:
     """Frames and the avatar's record. The typical pose comes first, as the reference for the others in its view."""
     background = [float(v) for v in job.form.clip.background]
@@ -280,12 +275,11 @@ def _judged(
             "key": str(_key(job, plan, frame)),
             "driven": place.relative_to(job.run).as_posix(),
         }
-        files += write_frame(place, rendered)
+        write_frame(place, rendered)
         if truths is None:
             checks, response, flicker = without_truth(missing)
         else:
             truth, own = truths.at(view.camera, frame.pose)
-            files += own
             entry["truth"] = own[0].relative_to(job.run).as_posix()
             compared.append(TruthPair.of(rendered, truth))
             checks = scores.appearance(compared[-1], extrapolated=view.extrapolated)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -13,8 +12,7 @@ import numpy as np
 from ..condition import PLAIN
 from ..contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose, Progress
 from ..engine.captures import open_clips
-from ..engine.job import Job
-from ..engine.jobs import make_jobs
+from ..engine.plan import Job, make_jobs
 from ..engine.store import RunFolder
 from ..errors import InputError
 from ..io.files import digest
@@ -129,22 +127,19 @@ def protocols(jobs: Sequence[Job], **parameters: Any) -> dict[str, Protocol]:
     return protocols_of(TASK, [_shown(driven) for driven in pairs])
 
 
-def drive(
-    job: Job, avatar: Avatar, progress: Progress, **parameters: Any
-) -> tuple[Rows, dict[str, Any], list[Path]]:
+def drive(job: Job, avatar: Avatar, progress: Progress, **parameters: Any) -> tuple[Rows, dict[str, Any]]:
     """Render and evaluate the avatar animated by every other subject; the registered change "reenact".
 
-    The details have the record of each pair. The files are the frames, and those of the source in ``sources``.
+    The details have the record of each pair. The frames of the source are in ``sources``.
     """
-    files: list[Path] = []
     rows: list[Row] = []
     avatars = []
     for driven in _pairs(job, **parameters):
         keys = _shown(driven).keys
-        own, record = judged_rows(job, keys, lambda d=driven: _judged(d, avatar, files, progress))  # type: ignore[misc]
+        own, record = judged_rows(job, keys, lambda d=driven: _judged(d, avatar, progress))  # type: ignore[misc]
         rows += own
         avatars.append(record)
-    return Rows.of(rows), {"avatars": avatars}, files
+    return Rows.of(rows), {"avatars": avatars}
 
 
 def _pairs(job: Job, source: str | None, camera: str | None, frames: int | None) -> list[Driven]:
@@ -175,9 +170,7 @@ def _target(driven: Driven, key: FrameKey) -> FrameKey:
     return FrameKey(driven.job.clip.subject, sequence, key.timestep, driven.camera.id)
 
 
-def _judged(
-    driven: Driven, avatar: Avatar, files: list[Path], report: Progress
-) -> tuple[list[JudgedFrame], dict[str, Any]]:
+def _judged(driven: Driven, avatar: Avatar, report: Progress) -> tuple[list[JudgedFrame], dict[str, Any]]:
     job, source, camera = driven.job, driven.source, driven.camera
     appearance = RecordedAppearance.recorded(job.form.clip, camera.id, REFERENCE_FRAMES)
     clip, out = job.form.clip, job.run
@@ -197,7 +190,7 @@ def _judged(
         rendered = job.cell.folder / f"{name}_{camera.id}.png"
         original = out / "sources" / f"{name}_{key.camera}.png"
         write_png(original, source.clip.image(key))
-        files += [*write_frame(rendered, frame), original]
+        write_frame(rendered, frame)
         checks = [*judge(found, reference, OWN_LIMITS), identity(appearance, frame, camera, pose)]
         frames.append(JudgedFrame(target, checks))
         places = {"source": original, "driven": rendered}

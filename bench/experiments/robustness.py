@@ -10,8 +10,8 @@ from typing import Any
 from ..condition import Condition, Named
 from ..contracts import Progress, no_progress
 from ..engine.config import with_methods
-from ..engine.jobs import trained
-from ..engine.run import run_locked
+from ..engine.plan import trained
+from ..engine.run import run
 from ..engine.store import RunFolder
 from ..executors.settings import check_executor
 from ..io.files import check_kind, output_inside, write_json
@@ -60,7 +60,7 @@ def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) ->
             source=settings.run,
         )
         clips = list({job.clip.subject: job.clip for job in jobs}.values())
-        rows = run_locked(config, execution, trust=settings.trust, clips=clips, reports=False)
+        rows = run(config, execution, clips=clips, is_locked=True, reports=False).rows
         _write_record(out, drive, rows, settings.others)
         shown: CommandResult = resolve(get("reports", "robustness").implementation)(out)
         return shown
@@ -80,9 +80,9 @@ def _write_record(out: Path, drive: str, rows: Rows, settings: dict[str, Any]) -
     for clip in manifest.clips:
         for method in manifest.methods:
             for seed in manifest.configuration.seeds:
-                state = folder.cell(clip.subject, method.label, seed).step("measure")
-                if (clip.subject, method.name, seed) not in places and state is not None:
-                    avatars += state["details"][drive]["avatars"]
+                details = folder.cell(clip.subject, method.label, seed).record.get("details", {})
+                if (clip.subject, method.name, seed) not in places and drive in details:
+                    avatars += details[drive]["avatars"]
     record = {
         "settings": settings,
         "limits": resolve(get("conditions", drive).implementation.partition(":")[0] + ":LIMITS"),

@@ -27,7 +27,7 @@ from ..contracts import (
     Splats,
 )
 from ..engine.adaptation import MethodNeeds
-from ..engine.job import Job
+from ..engine.plan import Job
 from ..engine.scoring import FULL
 from ..errors import UnavailableError
 from ..io.images import quantise, write_png
@@ -261,13 +261,12 @@ def splats_of(avatar: Avatar, pose: HeadPose) -> Splats | None:
     return avatar.splats(pose) if isinstance(avatar, SplatAvatar) else None
 
 
-def write_frame(path: Path, frame: Frame) -> list[Path]:
+def write_frame(path: Path, frame: Frame) -> None:
     """Write the frame as 8-bit PNG, unless it has non-finite values, which a PNG would hide."""
     if np.isfinite(frame.rgb).all():
         write_png(path, quantise(frame.rgb), RENDER)
-        return [path]
-    path.unlink(missing_ok=True)
-    return []
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _rows(job: Job, protocol: Protocol, frames: Sequence[JudgedFrame]) -> list[Row]:

@@ -18,7 +18,8 @@ from ..engine.config import (
     resolve_methods,
     resolve_metrics,
 )
-from ..engine.run import check_settings, run
+from ..engine.plan import check_settings
+from ..engine.run import run
 from ..errors import InputError
 from ..executors.settings import check_executor
 from ..io.files import write_text
@@ -104,7 +105,7 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
                 progress=progress,
             )
             own = replace(part, data=str(capture), out=str(Path(part.out) / f"{place + 1:02d}"))
-            rows = run(own, execution)
+            rows = run(own, execution).rows
             runs.append(Path(own.out))
             failed += rows.failed
             trained = any(not method.spec.trivial for method, _ in cells)

@@ -10,8 +10,8 @@ from ..condition import PLAIN, Condition, Named
 from ..contracts import Avatar, Clip, Progress, no_progress
 from ..engine.config import default_names, with_methods
 from ..engine.guard import TrainingView
-from ..engine.jobs import trained
-from ..engine.run import run_locked
+from ..engine.plan import trained
+from ..engine.run import run
 from ..engine.store import RunFolder
 from ..errors import InputError
 from ..io.files import check_kind, check_name, output_inside
@@ -71,7 +71,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Comm
             source=settings.run,
         )
         clips = list({job.clip.subject: job.clip for job in able}.values())
-        run_locked(config, execution, trust=settings.trust, clips=clips, reports=False)
+        run(config, execution, clips=clips, is_locked=True, reports=False)
         shown: CommandResult = resolve(get("reports", "pareto").implementation)(
             (str(out),), out, settings.task, settings.metric, settings.time
         )

@@ -18,8 +18,7 @@ class SweepSettings(RunOptions, ExecutionOptions):
     """Folder of a finished run."""
 
     out: str | None = None
-    """Folder to write, a run folder itself; default: `sweep` in the folder of the run. A sweep in it is continued: variants may
-    be added, but none left out."""
+    """Folder to write, a run folder itself; default: `sweep` in the folder of the run. The same sweep in it is continued."""
 
     methods: tuple[str, ...] = ()
     """Methods to derive from; default: all that provide variants."""

@@ -17,7 +17,7 @@ import numpy as np
 from skimage.color import deltaE_ciede2000
 
 from ..contracts import ByteArray, Camera, FloatArray, Frame, GroundTruth, HeadPose, TrueFrame
-from ..engine.job import Job
+from ..engine.plan import Job
 from ..engine.scoring import FULL, make_metric
 from ..errors import InputError, UnavailableError
 from ..io.files import digest

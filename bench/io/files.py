@@ -211,11 +211,11 @@ KINDS: Mapping[str, tuple[str, ...]] = {
         *("*/calibration/camera_params.json", "*/*/calibration/camera_params.json"),
     ),
     "a run": ("run.json",),
-    "a cell of a run": ("fit.json",),
+    "a cell of a run": ("cell.json",),
     "an avatar": ("avatar.json", "subject.npz"),
 }
 """Patterns of files and folders that identify a kind of folder."""
-RESULTS = {"rows.parquet", "headbench.json", "measure.json", "head_model.npz", "avatar.json"}
+RESULTS = {"rows.parquet", "headbench.json", "cell.json", "head_model.npz", "avatar.json"}
 """Files with results or captures, which are never the target of an option."""
 
 

@@ -6,6 +6,7 @@ WHAT is demo, suite, profiles or faces (a run of one subject), further (a folder
 pictures); OUT is the folder of the run or runs. A block of a page is between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -224,12 +225,12 @@ def block_of(page: Path, name: str) -> str:
 def store(run: Path, target: Path) -> None:
     """Copy manifest, without this machine's folders, protocols, rows and the record of extreme poses of a run."""
     manifest = RunFolder(run).read_manifest()
-    config, local = manifest.configuration, {name.rpartition(".")[2] for name in manifest.paths or {}}
+    config = manifest.configuration
     heads = {name: Path(path).name for name, path in config.heads.items()}
-    settings = {k: Path(str(v)).name if k in local else v for k, v in config.reader_settings.items()}
+    settings = {k: Path(v).name if os.path.isabs(str(v)) else v for k, v in config.reader_settings.items()}
     places = {"data": Path(config.data).name, "out": "", "source": config.source and Path(config.source).name}
     config = replace(config, **places, reader_settings=settings, heads=heads)
-    replace(manifest, configuration=config, paths=None).write(RunFolder(target).manifest)
+    replace(manifest, configuration=config).write(RunFolder(target).manifest)
     Rows.read(RunFolder(run).rows).in_single_precision().write(RunFolder(target).rows)
     if avatars := read_extremes([run]):
         write_json(target / FOLDER / RECORD_FILE, {"avatars": avatars})

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.engine.scoring import FULL
-from ...bench.engine.store import RunFolder
+from ...bench.engine.store import FinishedRun
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
 from ...bench.io.images import probe_image
@@ -64,10 +64,10 @@ class TitledTable:
     table: Table
 
 
-def write_page(run_folder: Path) -> list[Path]:
-    """Write ``report.html`` of a run that has just ended; return the file. This process has loaded the run's plug-ins."""
-    out = RunFolder(run_folder).page
-    write_report(PageSettings((str(run_folder),), str(out), trust=True))
+def write_page(run: FinishedRun) -> list[Path]:
+    """Write ``report.html`` of a run that has just ended; return the file."""
+    out = run.folder.page
+    _write(RunSet.read([run]), PageSettings((str(run.folder.root),), str(out)), out, MAX_MB, no_progress)
     return [out]
 
 
@@ -82,6 +82,12 @@ def write_report(settings: PageSettings, progress: Progress = no_progress) -> Co
     else:
         check_writable(out, "--out")
     runs = RunSet.read([Path(folder) for folder in settings.runs])
+    return _write(runs, settings, out, max_mb, progress)
+
+
+def _write(
+    runs: RunSet, settings: PageSettings, out: Path, max_mb: float, progress: Progress
+) -> CommandResult:
     page, pictures, files = page_text(runs, max_mb, settings, progress, apart=settings.split)
     if settings.split:
         write_pictures(out, files)

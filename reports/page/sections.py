@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -14,11 +15,11 @@ from typing import Any
 from markupsafe import Markup
 
 from ...bench.engine.stored import training_losses
-from ...bench.errors import InputError
+from ...bench.errors import HeadbenchError, InputError
 from ...bench.io.files import check_inside, entries, write_text
 from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
-from ...bench.registry import discover
+from ...bench.registry import get
 from ...bench.rows import ALL
 from ...bench.specs import MethodSpec, MetricSpec
 from ..aggregate import summarise
@@ -332,13 +333,12 @@ def cards_of(runs: RunSet) -> list[dict[str, Any]]:
     Summary, source and citation are those of the registered method of the same name and implementation; other methods
     have none. ``anchor`` is the name of the card in the page.
     """
-    specs = {name: plugin.spec for name, plugin in discover("methods").items()}
     cards = []
     for index, (label, record) in enumerate(runs.records.items()):
-        spec = specs.get(record.name)
-        known = (
-            spec if isinstance(spec, MethodSpec) and spec.implementation == record.implementation else None
-        )
+        known: MethodSpec | None = None
+        with suppress(HeadbenchError):  # no installed method
+            spec: MethodSpec = get("methods", record.name)
+            known = spec if spec.implementation == record.implementation else None
         budget = {name: value for name, value in record.budget.items() if value is not None}
         cards.append(
             {

@@ -15,7 +15,7 @@ from ...bench.contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadP
 from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
 from ...bench.engine.captures import open_clips, open_run_clips, reader_of, run_configuration
 from ...bench.engine.config import ResolvedMethod, RunConfig, resolve_methods
-from ...bench.engine.jobs import load, make_jobs
+from ...bench.engine.plan import make_jobs
 from ...bench.engine.store import RunFolder
 from ...bench.engine.stored import avatar_folder, open_avatar
 from ...bench.errors import HeadbenchError, InputError
@@ -186,13 +186,12 @@ def _opened(path: Path, settings: ViewSettings, kept: Path, missing: list[str]) 
     for job in make_jobs(
         replace(config, seeds=seeds), [(m, PLAIN) for m in methods], clips, {}, RunFolder(run), kept
     ):
-        state = job.cell.step("fit")
-        if state is None or state.get("status") != "done":
-            why = "not trained" if state is None else "its training did not end"
+        if not job.cell.is_trained:
+            why = "its training did not end" if "state" in job.cell.record else "not trained"
             missing.append(f"{job.name}: {why}")
             continue
         try:
-            avatar = load(job)
+            avatar = job.load()
         except HeadbenchError as error:
             missing.append(f"{job.name}: {error}")
             continue

@@ -14,6 +14,7 @@ import pytest
 
 from headbench.bench import cli, comparison
 from headbench.bench.engine import captures
+from headbench.bench.engine import run as runner
 from headbench.bench.engine.config import parse_size
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.registry import Plugin
@@ -198,8 +199,8 @@ def test_output_that_goes_nowhere():
 def seen(monkeypatch):
     """Configurations and executions of the runs that would be made."""
     seen = []
-    run = lambda config, execution, unchecked: seen.append((config, execution)) or CommandResult("", {})
-    monkeypatch.setattr(comparison, "_run", run)
+    monkeypatch.setattr(runner, "run", lambda config, execution, unchecked: seen.append((config, execution)))
+    monkeypatch.setattr(comparison, "_result", lambda run: CommandResult("", {}))
     return seen
 
 

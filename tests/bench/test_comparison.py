@@ -4,6 +4,7 @@ import pytest
 
 from headbench.bench import comparison
 from headbench.bench.contracts import no_progress
+from headbench.bench.engine import run as runner
 from headbench.bench.errors import InputError
 from headbench.bench.specs import CommandResult
 
@@ -21,11 +22,11 @@ def test_the_demo_says_how_long_it_takes(monkeypatch, tmp_path, preset, cores, e
 
     def run(config, execution, **record):
         started.append((config, execution))
-        return CommandResult("the table", {})
 
     monkeypatch.setattr(comparison, "processor_count", lambda: cores)
     monkeypatch.setattr(comparison, "resolve", lambda name: lambda **settings: None)
-    monkeypatch.setattr(comparison, "_run", run)
+    monkeypatch.setattr(runner, "run", run)
+    monkeypatch.setattr(comparison, "_result", lambda run: CommandResult("the table", {}))
     out = str(tmp_path / "out")
     result = comparison.demo(comparison.DemoSettings(out, preset), no_progress)
     ((config, execution),) = started

@@ -111,18 +111,16 @@ def test_a_spec_that_no_results_could_be_read_with_is_refused(spec, changes):
     ("change", "key"),
     [
         ({"fingerprint": 1}, "fingerprint"),
-        ({"fingerprints": []}, "fingerprints"),
-        ({"files": {"avatar/a.npz": 1}}, "files.avatar/a.npz"),
-        ({"files": {"../../a.npz": "0"}}, "files"),
+        ({"state": "done"}, "state"),
+        ({"measured": ["psnr", 1]}, "measured[1]"),
         ({"second": 1.5}, "second"),
     ],
 )
-def test_a_record_of_a_stage_that_is_none_is_refused_by_its_key(tmp_path, change, key):
+def test_a_record_of_a_cell_that_is_none_is_refused_by_its_key(tmp_path, change, key):
     cell = Cell(tmp_path)
-    cell.finish("fit", "f", seconds=1.5, files={"avatar/a.npz": "0"})
-    assert cell.step("fit")["seconds"] == 1.5
-    record = json.loads((tmp_path / "fit.json").read_text())
-    (tmp_path / "fit.json").write_text(json.dumps({**record, **change}))
-    with pytest.raises(InputError) as caught:
-        cell.step("fit")
+    cell.update(state="trained", training={"seconds": 1.5})
+    assert cell.record["training"]["seconds"] == 1.5
+    cell.update(**change)
+    with pytest.raises(InputError, match=f"Delete {tmp_path}; the same command makes it again") as caught:
+        _ = cell.record
     assert caught.value.key == key

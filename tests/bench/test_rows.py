@@ -7,7 +7,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from headbench.bench import rows as module
 from headbench.bench.errors import InputError
 from headbench.bench.rows import ALL, Row, Rows
 
@@ -79,7 +78,6 @@ def test_rows_of_metrics_are_the_queries_joined(rows):
     order = ["ssim", "absent", "psnr"]
     expected = Rows.joined([Rows(rows.select(**{**NAMED, "metric": name})) for name in order])
     assert rows.of_metrics(order).select(**NAMED).equals(expected.select(**NAMED))
-    assert rows.metrics_with_values == {"psnr", "ssim"}
 
 
 def test_many_parts_are_joined_in_order(rows):
@@ -173,25 +171,3 @@ def test_a_long_reason_is_shortened(rows, tmp_path):
 def test_no_rows_are_read_back_as_none(tmp_path):
     Rows.of([]).write(tmp_path / "rows.parquet")
     assert len(Rows.read(tmp_path / "rows.parquet")) == 0
-
-
-@pytest.mark.parametrize(
-    ("error", "is_damage"),
-    [
-        (ValueError("no Parquet"), True),
-        (OSError("unexpected end of stream"), True),  # pyarrow's of a damaged file
-        (OSError(5, "Input/output error"), False),
-    ],
-    ids=repr,
-)
-def test_rows_are_written_again_where_the_file_is_damaged(tmp_path, monkeypatch, error, is_damage):
-    def fail(path):
-        raise error
-
-    monkeypatch.setattr(module, "_read_table", fail)
-    (tmp_path / "rows.parquet").touch()
-    if is_damage:
-        assert module.earlier_rows(tmp_path / "rows.parquet") is None
-        return
-    with pytest.raises(InputError, match="Input/output error"):
-        module.earlier_rows(tmp_path / "rows.parquet")

@@ -287,11 +287,11 @@ STEPS = MetricSpec(
 )
 
 
-def report(run_folder):
-    path = run_folder / "mine.txt"
+def report(run):
+    path = run.folder.root / "mine.txt"
     path.write_text("mine")
     return [path]
 
 
-def failing_report(run_folder):
+def failing_report(run):
     raise RuntimeError("no ink")

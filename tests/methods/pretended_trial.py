@@ -15,7 +15,7 @@ import numpy as np
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.engine.config import RunOptions
-from headbench.bench.engine.jobs import trained
+from headbench.bench.engine.plan import trained
 
 from ..world import small_run
 from . import pretended

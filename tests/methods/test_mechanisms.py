@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from headbench.bench.contracts import Clip, no_progress
-from headbench.bench.engine.measuring import training_poses
+from headbench.bench.engine.cell import training_poses
 from headbench.methods.ours.avatar import OursAvatar
 from headbench.metrics.mechanism import dynamic_splats
 

@@ -18,7 +18,8 @@ from ....bench.condition import Condition, Named, label_of
 from ....bench.configuration import build
 from ....bench.contracts import Progress, no_progress
 from ....bench.engine.config import RunConfig, parse_size, resolve_cells
-from ....bench.engine.run import check_settings, run
+from ....bench.engine.plan import check_settings
+from ....bench.engine.run import run
 from ....bench.engine.scoring import FULL
 from ....bench.engine.store import RunFolder
 from ....bench.engine.stored import TRAINING_FILE
@@ -151,7 +152,7 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
     with log_to_file(out / "parity.log"):
         if settings.data is None:
             _make_capture(settings, out, progress)
-        rows = run(config, settings.execution)
+        rows = run(config, settings.execution).rows
     differences = differences_of(rows, native, official, config.seeds, condition)
     run_folder = RunFolder(Path(config.out))
     cells = {

@@ -68,12 +68,14 @@ def test_a_failure_in_an_executor_names_its_reason_and_log(run, tmp_path, monkey
 def test_the_rows_stand_in_one_table_with_the_runs_and_verify(run, images, tmp_path):
     from headbench.reports.runs import RunSet
 
-    before = scored(images, run, tmp_path / "out")
+    before = scored(images, run, tmp_path / "before")
     for path in images.iterdir():
         write_png(path, read_png(path) + 9)
-    after = scored(images, run, tmp_path / "out")  # changed images are scored again
+    after = scored(images, run, tmp_path / "out")
     assert (after["value"] < before["value"]).all()
     assert set(after["version"]) != set(before["version"])
+    with pytest.raises(InputError, match="methods.theirs.version: .*choose another --out"):
+        scored(images, run, tmp_path / "before")
     together = RunSet.read([run, tmp_path / "out"])
     assert together.methods == ("toy", "theirs")
     what = {"metric": "psnr", "task": ALL, "region": "full", "seeds": ALL}
@@ -91,7 +93,7 @@ def test_less_than_was_scored_is_refused(images, tmp_path):
         str(images), out=str(tmp_path / "out"), **given, metrics=("psnr", "toy_plugin:ERROR")
     )
     evaluate_folder(settings)
-    with pytest.raises(InputError, match="without error"):
+    with pytest.raises(InputError, match="configuration.metrics: "):
         evaluate_folder(replace(settings, metrics=("psnr",)))
 
 
@@ -131,10 +133,14 @@ def test_images_that_would_mislead_are_refused_by_name(run, images, tmp_path, co
 def test_labels_and_folders_that_are_taken_are_refused(run, images, tmp_path):
     with pytest.raises(InputError, match="ga-official"):
         scored(images, run, tmp_path / "out", label="ga")
-    with pytest.raises(InputError, match="a new folder, .* found a run of "):
+    with pytest.raises(
+        InputError, match="configuration.methods: expected toy_plugin:METHOD, as in this run, found theirs"
+    ):
         scored(images, run, run)
     scored(images, run, tmp_path / "out")
-    with pytest.raises(InputError, match="a new folder, "):
+    with pytest.raises(
+        InputError, match="configuration.methods: expected theirs, as in this run, found others"
+    ):
         scored(images, run, tmp_path / "out", label="others")
 
 

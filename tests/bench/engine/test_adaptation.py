@@ -13,7 +13,7 @@ from headbench.bench.engine import run as runner
 from headbench.bench.engine.adaptation import MethodNeeds, plan
 from headbench.bench.engine.captures import open_clips
 from headbench.bench.engine.config import RunOptions
-from headbench.bench.engine.jobs import trained
+from headbench.bench.engine.plan import trained
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
@@ -55,15 +55,15 @@ def test_a_method_without_needs_gets_the_clip_itself(config, toy, cell):
     # The formula before methods had needs: avatars trained then stay valid.
     method = {name: value for name, value in record["methods"][0].items() if name != "codec"}
     expected = digest(1, method, 0, "cpu", "toy-subject1")
-    assert cell.step("fit")["fingerprint"] == expected
+    assert cell.record["fingerprint"] == expected
 
 
 def test_renders_of_the_adapted_clip_are_brought_back(config, toy, monkeypatch, cell):
     for name in ("MIRROR", "METHOD"):
         declare(monkeypatch, toy, name, resolution=TWICE)
     methods = ("toy_plugin:MIRROR", "toy_plugin:METHOD")
-    run = dataclasses.replace(config, methods=methods, heads={"flame2020": "somewhere"}, seeds=(0, 1))
-    assert runner.run(run).failed == []
+    run = dataclasses.replace(config, methods=methods, heads={"flame2020": "/somewhere"}, seeds=(0, 1))
+    assert runner.run(run).rows.failed == []
     assert toy.ADAPTED == ["subject1"]  # once for both, whose needs are equal
     assert toy.WORKLOAD_SIZES == {(32, 24)}  # at which speed is measured
     for key in toy.ToyClip("subject1").splits["novel_view"]:
@@ -76,7 +76,7 @@ def test_renders_of_the_adapted_clip_are_brought_back(config, toy, monkeypatch, 
     assert {each["method"] for each in record["adapted"]} == {"mirror", "toy"}
     assert adapted["fingerprint"] == "toy-subject1-adapted"
     assert [step["name"] for step in adapted["steps"]] == ["adapt"]
-    assert adapted["steps"][0]["parameters"] == {"heads": {"flame2020": "somewhere"}}
+    assert adapted["steps"][0]["parameters"] == {"heads": {"flame2020": "/somewhere"}}
     assert record["methods"][0]["needs"]["resolution"]["size"] == [16, 12]
 
 
@@ -135,7 +135,7 @@ def test_a_reduced_comparison_has_another_size_and_another_hash(config, toy):
     record = {}
     for divide in (1, 2):
         chosen = dataclasses.replace(config, divide=divide, out=f"{config.out}{divide}")
-        assert runner.run(chosen).failed == []
+        assert runner.run(chosen).rows.failed == []
         manifest = manifest_of(chosen)
         record[divide] = RunFolder(Path(chosen.out)).read_manifest().protocols["novel_view"]
         # Whoever opens the captures of a run again, as reports do, sees what was measured.

@@ -33,13 +33,13 @@ def qualities(rows, label):
 def test_derived_cells_follow_all_trainings(deriving, toy):
     labels = [name.partition(",")[0] for name in planned_cells(deriving)]
     assert labels.index("varying+dark") > max(labels.index(name) for name in ("varying", "toy"))
-    rows = runner.run(deriving)
+    rows = runner.run(deriving).rows
     assert len(toy.FITS) == 2
     assert set(qualities(rows, "varying+dark")["status"]) == {"ok"}
     other = Path(deriving.out) / "trained"
     dark = runner.run(
         replace(deriving, out=str(other), conditions=(PLAIN,), settings={"varying": {"level": 0.25}})
-    )
+    ).rows
     assert qualities(rows, "varying+dark")["value"].tolist() == qualities(dark, "varying")["value"].tolist()
     codecs = {method.label: method.codec for method in RunFolder(Path(deriving.out)).read_manifest().methods}
     assert codecs == dict.fromkeys(("varying+dark", "varying", "toy"), "")
@@ -50,11 +50,11 @@ def test_a_run_killed_before_it_derives_continues(deriving, toy, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("headbench.bench.engine.jobs.derive", killed)
+        patch.setattr("headbench.bench.engine.cell.derive", killed)
         with pytest.raises(KeyboardInterrupt):
             runner.run(deriving)
     trained = len(toy.FITS)
-    rows = runner.run(deriving)
+    rows = runner.run(deriving).rows
     assert len(toy.FITS) == trained
     assert set(qualities(rows, "varying+dark")["status"]) == {"ok"}
     made = len(toy.MADE)
@@ -62,18 +62,9 @@ def test_a_run_killed_before_it_derives_continues(deriving, toy, monkeypatch):
     assert len(toy.MADE) == made  # what is finished stays
 
 
-def test_a_damaged_derived_avatar_is_derived_again(deriving, toy):
-    runner.run(deriving)
-    made, trained = len(toy.MADE), len(toy.FITS)
-    (RunFolder(Path(deriving.out)).cell("subject1", "varying+dark", 0).avatar / "level.txt").write_text("0.9")
-    rows = runner.run(deriving)
-    assert (len(toy.MADE), len(toy.FITS)) == (made + 1, trained)
-    assert set(qualities(rows, "varying+dark")["status"]) == {"ok"}
-
-
 def test_a_failed_training_fails_what_is_derived(deriving, toy):
     failing = replace(deriving, settings={"varying": {"fail": True}})
-    rows = runner.run(failing)
+    rows = runner.run(failing).rows
     derived = qualities(rows, "varying+dark")
     assert set(derived["status"]) == {"failed"}
     assert derived["reason"].str.contains("expected a trained avatar").all()

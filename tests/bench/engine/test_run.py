@@ -1,5 +1,6 @@
 """The harness on toy plug-ins: what a run leaves, resumes, refuses and records."""
 
+import errno
 import importlib
 import shutil
 import sys
@@ -15,13 +16,15 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.condition import PLAIN, Condition
+from headbench.bench.engine import cell as cells
 from headbench.bench.engine import config as runner_config
-from headbench.bench.engine import job, measuring, training
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.io.documents import read_json
+from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
+from headbench.bench.manifest import Manifest
 from headbench.bench.registry import Plugin
 from headbench.bench.rows import Rows
 from headbench.bench.specs import ReportSpec
@@ -120,8 +123,8 @@ def test_the_record_of_training_counts_interruptions(config, toy, monkeypatch, c
             with pytest.raises(KeyboardInterrupt):
                 runner.run(config)
     runner.run(config)
-    assert cell.step("fit")["interruptions"] == 2
-    assert RunFolder(Path(config.out)).cell("subject2", "toy", 0).step("fit")["interruptions"] == 0
+    assert cell.record["training"]["interruptions"] == 2
+    assert RunFolder(Path(config.out)).cell("subject2", "toy", 0).record["training"]["interruptions"] == 0
 
 
 def test_what_a_method_prepares_is_not_timed_as_training(config, toy, monkeypatch, cell):
@@ -141,12 +144,12 @@ def test_what_a_method_prepares_is_not_timed_as_training(config, toy, monkeypatc
     monkeypatch.setattr(toy.ToyMethod, "prepare", prepare, raising=False)
     monkeypatch.setattr(toy.ToyMethod, "fit", timed_fit)
     monkeypatch.setattr(
-        training, "time", types.SimpleNamespace(perf_counter=lambda: now[0], monotonic=time.monotonic)
+        cells, "time", types.SimpleNamespace(perf_counter=lambda: now[0], monotonic=time.monotonic)
     )
     runner.run(config)
     assert order[:2] == ["cpu", "fit"]
-    assert cell.step("fit")["seconds"] == 1.0
-    assert "peak_device_memory_bytes" not in cell.step("fit")
+    assert cell.record["training"]["seconds"] == 1.0
+    assert "peak_device_memory_bytes" not in cell.record["training"]
 
 
 @pytest.mark.parametrize("native", [True, False])
@@ -168,12 +171,7 @@ def test_an_avatar_that_renders_lists_is_asked_for_lists(config, toy):
     one_by_one = rows_of(config, methods=("toy_plugin:MIRROR",), metrics=metrics, out=f"{config.out}-one")
     expected = one_by_one[one_by_one["metric"] == "psnr"]["value"]
     assert by_metric["psnr"]["value"].tolist() == expected.tolist()
-    # The tasks are one list each, and what is rendered already is not asked for again.
-    assert [len(keys) for keys in toy.LISTS] == [3, 2] * 2
-    toy.LISTS.clear()
-    next((Path(config.out) / "subject1" / "listing").rglob("*.png")).unlink()
-    rows_of(config, methods=("toy_plugin:LISTING",), metrics=metrics)
-    assert [len(keys) for keys in toy.LISTS] == [1]
+    assert [len(keys) for keys in toy.LISTS] == [3, 2] * 2  # a list for each task
 
 
 def test_a_list_that_comes_back_short_fails_the_cell(config, toy, monkeypatch):
@@ -208,113 +206,166 @@ def test_a_capture_without_a_head_is_refused(config, refuses):
     refuses(config, "capture of subject-wall: expected a capture without .* found HB701: no head is seen.")
     assert "--unchecked" in str(pytest.raises(InputError, runner.run, config).value)
     runner.run(config, unchecked=True)
-    runner.run(replace(config, seeds=(0, 1)))  # of captures that the run has
+    runner.run(config)
     assert RunFolder(Path(config.out)).read_manifest().unchecked
 
 
-def test_other_settings_in_the_same_folder_are_refused(config, kept, refuses):
-    kept(config)
-    other = "data, config.level 0.75, found one of other settings, config.level .*Choose another --out"
-    refuses(config, other, settings={"toy": {"level": 0.75}})
-    refuses(config, "configuration.preset: expected smoke, as in this run", preset="fast")
+BOTH = {"methods": ("toy_plugin:METHOD", "toy_plugin:MIRROR")}
+OTHER = {
+    "methods": (
+        BOTH,
+        "configuration.methods: expected toy_plugin:METHOD, as in this run, found toy_plugin:METHOD, toy_p",
+    ),
+    "seeds": ({"seeds": (1,)}, "configuration.seeds: expected 0, as in this run, found 1"),
+    "preset": ({"preset": "fast"}, "configuration.preset: expected smoke, as in this run, found fast"),
+    "metrics": (
+        {"metrics": ("toy_plugin:ERROR",)},
+        "metrics: expected toy_plugin:ERROR, toy_plugin:FILES, as",
+    ),
+    "tasks": ({"tasks": ("novel_view",)}, "configuration.tasks: "),
+    "frames": (
+        {"frames_per_task": 1},
+        "configuration.frames_per_task: expected none, as in this run, found 1",
+    ),
+    "regions": ({"regions": ()}, "configuration.regions: "),
+    "a method's setting": (
+        {"settings": {"toy": {"level": 0.75}}},
+        "methods.toy.config.level: expected 0.5, .* found 0.75",
+    ),
+    "a condition": (
+        {"conditions": (PLAIN, Condition("half", ("toy",), {"level": 0.75}))},
+        "configuration.conditions.half: expected none, as in this run, found name half, methods toy, settings level 0.75",
+    ),
+    "two": (
+        {"seeds": (1,), "preset": "fast"},
+        "preset, configuration.seeds: expected smoke; 0, .*, found fast; 1",
+    ),
+}
 
 
-BOTH = {"methods": ("toy_plugin:METHOD", "toy_plugin:MIRROR"), "seeds": (0, 1)}
-
-
-def test_a_run_that_would_lose_rows_is_refused(config, kept, refuses, tmp_path):
-    config = replace(config, **BOTH)
+@pytest.mark.parametrize("case", OTHER)
+def test_another_configuration_is_refused_and_named(config, kept, refuses, case):
+    changes, match = OTHER[case]
     kept(config)
     folder = RunFolder(Path(config.out))
     before = folder.rows.read_bytes(), folder.manifest.read_bytes()
-    for name in ("subject1", "subject2", "subject3"):
-        (tmp_path / "more" / name).mkdir(parents=True)
-    refuses(config, "captures or frames of novel_view: ", data=str(tmp_path / "more"))
-    refuses(config, "regions: ", regions=())
+    refuses(config, f"{match}.*A run does not change: choose another --out", **changes)
     assert (folder.rows.read_bytes(), folder.manifest.read_bytes()) == before
-    folder.rows.unlink()  # as the error says, for those who want that
-    assert len(rows_of(config, regions=()))
 
 
-LESS = [
-    {"methods": ("toy_plugin:METHOD",), "seeds": (1,)},
-    {"metrics": ("toy_plugin:ERROR",)},
-    {"tasks": ("novel_view",)},
-    {"frames_per_task": 1},
-]
-
-
-@pytest.mark.parametrize("less", LESS)
-def test_results_that_are_not_asked_for_again_are_kept(config, kept, toy, less):
-    methods, metrics = ("toy_plugin:METHOD", "mean-image"), ("toy_plugin:ERROR", "psnr")
-    config = replace(config, methods=methods, metrics=metrics, seeds=(0, 1))
-    before = kept(config)
-    assert rows_of(config, **less).equals(before)
-    assert not toy.FITS
-
-
-def test_frames_may_be_added(config, toy):
-    few = rows_of(config, frames_per_task=1)
-    toy.FITS.clear()
-    every = rows_of(config)
-    assert not toy.FITS
-    assert len(every) > len(few)
-    same = [name for name in few if name != "protocol"]
-    assert len(every.merge(few, on=same)) == len(few)
-
-
-def test_a_condition_is_a_cell_and_a_column(config, kept, toy):
-    changed = Condition("half", ("toy",), {"level": 0.75})
-    plain = kept(config)
-    rows = rows_of(config, conditions=(PLAIN, changed))
-    assert set(rows["condition"]) == {"", "half"}
-    assert rows[rows["condition"] == ""].reset_index(drop=True).equals(plain)
-    cell = RunFolder(Path(config.out)).cell("subject1", "toy+half", 0)
-    assert cell.step("fit")["method"]["config"]["level"] == 0.75
-
-
-def test_methods_seeds_and_metrics_may_be_added(config, kept, toy):
-    before = kept(config)
-    toy.FITS.clear()
-    more = (*config.metrics, "toy_plugin:FILES_LOAD")
-    rows = rows_of(config, **BOTH, metrics=more, tasks=config.tasks[::-1])
-    assert len(rows.merge(before)) == len(before)
-    assert len(rows) == 4 * (len(before) + 2)
-    assert len(toy.FITS) == 6
-
-
-def test_values_that_cannot_be_had_again_stay(config, kept, toy, cell, monkeypatch):
+def test_other_captures_are_refused_the_same_elsewhere_continue(config, kept, refuses, tmp_path, toy):
     rows = kept(config)
-    (cell.avatar / "level.txt").unlink()
-    monkeypatch.setattr(toy.ToyMethod, "fit", lambda *arguments, **options: 1 / 0)
-    with pytest.raises(InputError, match="found 6 without, such as error full toy 0 novel_view subject1 EMO"):
-        runner.run(config)
-    file = RunFolder(Path(config.out)).rows
-    assert pd.read_parquet(file).equals(rows)
-    file.unlink()
-    assert set(rows_of(config).query("subject == 'subject1'")["status"]) == {"failed"}
+    shutil.copytree(config.data, tmp_path / "more")
+    assert rows_of(config, data=str(tmp_path / "more")).equals(rows)
+    assert toy.FITS == []
+    (tmp_path / "more" / "subject3").mkdir()
+    refuses(
+        config, "captures.subject3, protocols.novel_view, .*: expected none; ", data=str(tmp_path / "more")
+    )
 
 
-def test_what_a_killed_run_measured_stays(config, kept, toy, monkeypatch):
-    """No rows of the run exist yet that could be lost, those of its cells do."""
-    whole = kept(config)
+def test_a_finished_run_is_read_back(config, kept, toy, monkeypatch, cell):
+    """Also without the avatars, which may be deleted; nothing is trained, rendered or measured."""
+    rows = kept(config)
+    for name in ("avatar", "renders"):
+        shutil.rmtree(cell.folder / name)
+    monkeypatch.setattr(toy.ToyMethod, "load", lambda *arguments, **options: 1 / 0)
     RunFolder(Path(config.out)).rows.unlink()
-    rows_of(config, metrics=("toy_plugin:ERROR",))
-    monkeypatch.setattr(toy, "files_in_avatar", lambda *arguments: 1 / 0)
-    assert rows_of(config).equals(whole)
+    assert rows_of(config).equals(rows)
+
+
+def test_a_failed_cell_is_repeated(config, toy, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(toy.ToyAvatar, "render", lambda *arguments: 1 / 0)
+        assert set(rows_of(config)["status"]) == {"failed"}
+    toy.FITS.clear()
+    assert set(rows_of(config)["status"]) == {"ok"}
+    assert toy.FITS == []
+
+
+def test_a_full_disk_ends_the_run_and_loses_no_cell(config, toy, monkeypatch, cell):
+    original = toy.ToyMethod.fit
+
+    def full(self, clip, *arguments, **options):
+        if clip.subject == "subject2":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return original(self, clip, *arguments, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(toy.ToyMethod, "fit", full)
+        with pytest.raises(OSError, match="No space left"):
+            runner.run(config)
+    assert len(cell.record["measured"]) == 2
+    toy.FITS.clear()
+    assert set(rows_of(config)["status"]) == {"ok"}
+    assert toy.FITS == ["subject2"]
+
+
+def test_more_is_measured_of_the_avatars_of_a_run(config, kept, toy):
+    """Rendered and measured as by a run of its own, also under conditions; trained never."""
+    config = replace(config, conditions=(PLAIN, Condition("half", ("toy",), {"level": 0.75})))
+    kept(config)
+    more = replace(config, metrics=("toy_plugin:ERROR", "psnr", "toy_plugin:STEPS"))
+    found = rows_of(more, source=config.out, out=f"{config.out}-more")
+    assert toy.FITS == []
+    assert found.equals(rows_of(more, out=f"{config.out}-whole"))
+
+
+def test_the_command_measures_more_of_the_avatars_of_a_run(config, kept, toy, capsys):
+    kept(config, methods=BOTH["methods"], conditions=(PLAIN, Condition("half", ("toy",), {"level": 0.75})))
+    words = ["run", "--from", config.out, "--out", f"{config.out}-more", "--metrics", "psnr"]
+    assert cli.main(words) == 2
+    assert "configuration.reader: expected names that run no code of others" in capsys.readouterr().err
+    named = ["--methods", ",".join(BOTH["methods"]), "--set", "reader=toy_plugin:READER"]
+    assert cli.main([*words, *named]) == 0
+    rows = pd.read_parquet(RunFolder(Path(f"{config.out}-more")).rows)
+    assert {*zip(rows["method"], rows["condition"])} == {("toy", ""), ("toy", "half"), ("mirror", "")}
+    assert set(rows["metric"]) == {"psnr"}
+    assert toy.FITS == []
+
+
+DAMAGE = {
+    "cell.json": (
+        "subject1/toy/seed-0/cell.json",
+        "Delete .*subject1/toy/seed-0; the same command makes it again",
+    ),
+    "run.json": ("run.json", "run.json"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_damaged_record_is_refused_and_named(config, kept, refuses, name):
+    kept(config)
+    path, match = DAMAGE[name]
+    (Path(config.out) / path).write_text("noise")
+    refuses(config, match)
+
+
+def test_a_cell_of_other_inputs_or_none_is_not_overwritten(config, kept, cell, refuses):
+    kept(config)
+    cell.update(fingerprint="other")
+    refuses(config, "cell.json, fingerprint: expected the data.* Choose another --out, or delete ")
+    cell.file.unlink()
+    reasons = rows_of(config).query("status == 'failed'")["reason"]
+    assert reasons.str.contains("the record of the avatar in it, found none. Delete ").all()
+    assert len(reasons)
+
+
+def test_a_run_of_an_earlier_version_is_refused(config, kept, refuses):
+    kept(config)
+    folder = RunFolder(Path(config.out))
+    write_json(folder.manifest, {**read_json(folder.manifest), "format": 2})
+    refuses(config, "format: expected 3, found 2 .int.. The folder is of an earlier version of headbench")
 
 
 @pytest.fixture
 def edit(toy, tmp_path, monkeypatch):
-    """Write plug-ins, a method of two files and a metric, with parts of their text replaced, to be imported anew."""
+    """Write a method of two files, with parts of their text replaced, to be imported anew."""
     texts = {
         "edited_plugin": "import edited_level, toy_plugin as toy\n"
         "class Method(toy.ToyMethod):\n    pass\n"
         "METHOD = toy.replace(toy.METHOD, implementation='edited_plugin:Method')\n",
         "edited_level": "LEVEL = 1",
-        "edited_metric": "import toy_plugin as toy\n"
-        "def error(image, truth):\n    return toy.mean_error(image, truth)\n"
-        "ERROR = toy.replace(toy.ERROR, implementation='edited_metric:error')\n",
     }
     folders = {name: tmp_path / name.partition("_")[2].replace("level", "plugin") for name in texts}
     for folder in {*folders.values()}:
@@ -333,7 +384,7 @@ def edit(toy, tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
-EDITED = {"methods": ("edited_plugin:METHOD",), "metrics": ("edited_metric:ERROR", "toy_plugin:FILES")}
+EDITED = {"methods": ("edited_plugin:METHOD",)}
 
 
 @pytest.mark.parametrize("kill", [False, True])
@@ -345,52 +396,25 @@ def test_changed_code_of_a_plug_in_is_refused(config, edit, toy, refuses, monkey
             patch.setattr(toy.ToyMethod, "fit", killed)
         with pytest.raises(KeyboardInterrupt) if kill else nullcontext():
             runner.run(config)
-    when = "in an earlier run" if kill else r"\d+ s ago"
     for file, change in (("edited_level", ("1", "2")), ("edited_plugin", ("pass", "..."))):
         edit(**{file: change})
-        refuses(config, f"method, code: .*edited_plugin:Method.*changed since its training {when}")
+        refuses(config, "methods.toy.code: expected .*, as in this run")
     edit()
     runner.run(config)
     assert len(toy.FITS) == 2 * kill
 
 
-def test_an_edited_plug_in_trains_again_once_avatars_are_deleted(config, edit, toy, cell):
-    """As the tutorial of an own method says."""
-    config = replace(config, **EDITED)
-    runner.run(config)
-    before = cell.step("fit")
-    edit(edited_level=("1", "2"))
-    for folder in Path(config.out).glob("*/toy"):
-        shutil.rmtree(folder)
-    toy.FITS.clear()
-    runner.run(config)
-    assert toy.FITS == ["subject1", "subject2"]
-    assert cell.step("fit")["fingerprint"] != before["fingerprint"]
-
-
-def test_changed_code_of_a_metric_is_measured_again(config, edit, toy):
-    config = replace(config, **EDITED)
-    before = rows_of(config)
-    toy.FITS.clear()
-    edit(edited_metric=("(image, truth)\nE", "(image, truth) + 1\nE"))
-    after = rows_of(config)
-    assert (after["value"] - before["value"]).tolist() == [float(m == "error") for m in after["metric"]]
-    assert toy.FITS == []
-
-
-def test_changed_code_of_a_native_method_is_warned_of(config, cell, monkeypatch, caplog):
+def test_changed_code_of_a_native_method_is_warned_of(config, monkeypatch, caplog):
     """Its version says whether the results are other ones, and whoever edits it may forget that."""
-    for module in (job, measuring, runner_config):
-        monkeypatch.setattr(module, "is_outside", lambda reference: False)
+    monkeypatch.setattr(runner_config, "is_outside", lambda reference: False)
     codes = ["first"]
-    for module in (measuring, runner_config):
-        monkeypatch.setattr(module, "code_digest", lambda reference: codes[-1])
+    monkeypatch.setattr(runner_config, "code_digest", lambda reference: codes[-1])
     rows = rows_of(config)
     assert rows_of(config).equals(rows)
     assert "has changed" not in caplog.text
     codes.append("second")
     assert rows_of(config).equals(rows)
-    assert f"delete {cell.folder} to train it again" in caplog.text
+    assert "The code of toy has changed since this run was begun" in caplog.text
     assert manifest_of(config)["methods"][0]["code"] == "second"
 
 
@@ -422,10 +446,7 @@ def test_frames_as_good_as_the_truth_are_suspect_and_not_ranked(config, toy, mon
     assert groups == {METHODS_TITLE: ["toy"], SUSPECT_TITLE: ["mirror"]}
 
 
-def test_a_missing_metric_has_its_reason_and_is_measured_later(config, toy, monkeypatch, caplog):
-    counted = []
-    original = toy.mean_error
-    monkeypatch.setattr(toy, "mean_error", lambda *pair: counted.append(1) or original(*pair))
+def test_a_missing_metric_has_its_reason(config, caplog):
     both = replace(config, metrics=("toy_plugin:NOT_HERE", "toy_plugin:ERROR"))
     rows = rows_of(both)
     missing = rows[rows["metric"] == "not_here"]
@@ -433,10 +454,6 @@ def test_a_missing_metric_has_its_reason_and_is_measured_later(config, toy, monk
     assert missing["reason"].str.contains("Put them there").all()
     assert missing["value"].isna().all()
     assert "Absent will be missing" in caplog.records[0].getMessage()
-    counted.clear()
-    monkeypatch.setattr(toy, "not_here", lambda image, truth: 1.0)
-    assert (rows_of(both)["status"] == "ok").all()
-    assert len(counted) == 1  # the check before training, nothing else
 
 
 def test_metrics_of_one_measurement_are_taken_together_and_once(config, toy, monkeypatch):
@@ -451,16 +468,12 @@ def test_metrics_of_one_measurement_are_taken_together_and_once(config, toy, mon
     assert rows.loc[("subject1", "files_none"), "status"] == "missing"
     assert rows_of(config, metrics=group).set_index(["subject", "metric"]).equals(rows)
     assert len(counted) == 2
-    runner.run(replace(config, out=config.out + "-less", metrics=group[1:2]))
-    assert len(counted) == 4
-    runner.run(replace(config, out=config.out + "-less", metrics=group))
-    assert len(counted) == 6  # another number of it: all of it again
 
 
 def test_a_metric_of_training_sees_the_record_of_the_fit(config, cell):
     assert rows_of(config, metrics=("toy_plugin:STEPS",))["value"].tolist() == [2.0, 2.0]
-    measured = cell.step("measure")["details"]["steps"]
-    assert measured["peak"] >= cell.step("fit")["memory_before_bytes"] > 0
+    measured = cell.record["details"]["steps"]
+    assert measured["peak"] >= cell.record["training"]["memory_before_bytes"] > 0
 
 
 @pytest.mark.parametrize(
@@ -505,6 +518,21 @@ def test_two_runs_in_one_folder_are_refused_before_training(config, refuses):
     assert not (Path(config.out) / "run.lock").exists()
 
 
+WRITE_REPORTS = runner.write_reports
+
+
+def test_reports_open_neither_run_nor_captures_again(config, toy, monkeypatch):
+    opened = []
+    monkeypatch.setattr(runner, "write_reports", WRITE_REPORTS)
+    monkeypatch.setattr(toy, "read", lambda path: opened.append(path) or toy.ToyClip(path))
+    for kind in (Manifest, Rows):
+        monkeypatch.setattr(kind, "read", lambda path: pytest.fail("read again"))
+    folder = runner.run(replace(config, metrics=("psnr",))).folder
+    assert folder.page.is_file()
+    assert folder.contact_sheet.is_file()
+    assert len(opened) == 2  # subjects
+
+
 def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
     caplog.set_level("WARNING", logger="headbench")
     plugins = [
@@ -514,7 +542,7 @@ def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
         Plugin("mine", "other 1", ReportSpec("mine", "", "toy_plugin:report")),
     ]
     monkeypatch.setattr(runner, "discover", lambda group: {plugin.name: plugin for plugin in plugins})
-    assert runner.write_reports(tmp_path) == [tmp_path / "mine.txt"]
+    assert runner.write_reports(types.SimpleNamespace(folder=RunFolder(tmp_path))) == [tmp_path / "mine.txt"]
     assert (tmp_path / "mine.txt").read_text() == "mine"
     messages = [record.getMessage() for record in caplog.records]
     assert len(messages) == 2
@@ -522,8 +550,8 @@ def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
     assert "'failing' of other 1 failed" in messages[1]
 
 
-REPLACED = ("run.json", "rows.parquet", "contact_sheet.png", "report.html", "tables")
-REFUSED = ("protocols", "subject1/toy/seed-0/avatar/level.txt", "subject1/toy/seed-0/renders")
+REPLACED = ("rows.parquet", "contact_sheet.png", "report.html", "tables")
+REFUSED = ("run.json", "protocols", "subject1/toy/seed-0/avatar/level.txt", "subject1/toy/seed-0/renders")
 
 
 @pytest.mark.parametrize(("places", "expected"), [(REPLACED, 0), *(((place,), 2) for place in REFUSED)])

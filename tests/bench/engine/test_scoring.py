@@ -10,8 +10,8 @@ import pytest
 
 from headbench.bench.contracts import FrameKey
 from headbench.bench.engine import scoring
+from headbench.bench.engine.cell import training_poses
 from headbench.bench.engine.config import RunConfig, resolve_metrics
-from headbench.bench.engine.measuring import training_poses
 from headbench.bench.engine.scoring import ScoredFrames, check_regions, score_frames
 from headbench.bench.errors import HeadbenchError, InputError, LeftOutError, UnavailableError
 from headbench.bench.specs import MetricSpec

@@ -36,7 +36,7 @@ def test_an_avatar_is_loaded_from_its_cell_or_from_anywhere(cell, folder):
     assert stored.record["method"] == "ga"
     assert stored.record["made_by"] == "training"
     assert stored.record["origin"]["seed"] == 0
-    trained = json.loads((cell.folder / "fit.json").read_text())["method"]
+    trained = cell.record["method"]
     assert stored.method.record()["config"] == trained["config"]
     assert stored.heads == {stored.record["head_model"]: str(folder / HEAD_FILE)}
 

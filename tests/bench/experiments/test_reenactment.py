@@ -60,7 +60,7 @@ def test_another_performance_is_another_protocol(ball_run):
         reenact_run(settings(folder, frames=frames, out=str(out)))
         hashes |= set(pd.read_parquet(out / "rows.parquet")["protocol"])
     assert len(hashes) == 2
-    with pytest.raises(InputError, match="Choose another --out"):  # the rows of two frames would be lost
+    with pytest.raises(InputError, match="choose another --out"):  # the rows of two frames would be lost
         reenact_run(settings(folder, frames=1, out=str(out)))
 
 
@@ -72,9 +72,6 @@ def test_the_source_is_shown_in_the_same_camera(ball_run):
     (first, *_) = json.loads((out / RECORD_FILE).read_text())["avatars"]
     assert [s["source"] for s in first["shown"]] == [f"sources/ball-bee_FREE_{t:05d}_1.png" for t in (4, 5)]
     source = out / first["shown"][1]["source"]
-    assert (read_png(source) == 200).all()
-    source.write_bytes(b"")
-    reenact_run(settings(folder, camera="1"))
     assert (read_png(source) == 200).all()
 
 
@@ -128,7 +125,7 @@ def test_a_source_beside_the_run_and_what_is_refused(ball_run, tmp_path, balls, 
             changes.pop()
     (tmp_path / "data" / "ball-bee").rmdir()
     with pytest.raises(InputError, match="--source"):
-        reenact_run(settings(folder, out=str(tmp_path / "out")))
+        reenact_run(settings(folder, data=str(tmp_path / "data"), out=str(tmp_path / "out")))
 
 
 def poses(seed, count=5, spread=0.3):

@@ -60,7 +60,9 @@ def asked(monkeypatch, tmp_path):
         }
         monkeypatch.setattr(module, "resolve", found.__getitem__)
         monkeypatch.setattr(
-            module, "run", lambda config, execution: runs.append(config) or SimpleNamespace(failed=[])
+            module,
+            "run",
+            lambda config, execution: runs.append(config) or SimpleNamespace(rows=SimpleNamespace(failed=[])),
         )
         monkeypatch.setattr(module, "closing", lambda run, rows: "")
         monkeypatch.setattr(module, "extremes_run", lambda settings, progress: driven.append(settings.run))

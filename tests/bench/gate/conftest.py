@@ -26,9 +26,7 @@ def remeasured(config):
         assert frames
         for path in frames:
             write_png(path, change(read_png(path)))
-        rendered = cell.step("digests")
-        files = {**rendered["files"], **cell.digests(frames)}
-        cell.finish("digests", rendered["fingerprint"], files=files)
+        cell.update(measured=None)
         runner.run(config)
         return pd.read_parquet(folder.rows)
 

@@ -9,7 +9,9 @@ import pandas as pd
 import pytest
 
 from headbench.bench.contracts import FrameKey
+from headbench.bench.engine.captures import open_run_clips
 from headbench.bench.engine.config import RunOptions
+from headbench.bench.engine.store import FinishedRun, RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.rows import ALL, Rows
 from headbench.reports.page import frames, sections
@@ -204,7 +206,7 @@ def test_a_failed_method_stands_with_its_error(toy_page):
 def test_without_the_capture_the_page_says_why(page, toy_run, tmp_path):
     (tmp_path / "data").rename(tmp_path / "gone")
     found = page()
-    assert "neither there" in found.data["reasons"][0]
+    assert "found nothing there" in found.data["reasons"][0]
     assert str(tmp_path) not in " ".join(found.texts.values())
     assert all(entry["p"][0] == -1 and entry["p"][1] >= 0 for entry in found.data["frames"])
     assert "no ground truth on this page" in " ".join(found.texts.values())
@@ -374,8 +376,11 @@ def test_losses_are_means_of_subjects_with_equal_iterations(make_run, first, sec
 
 
 def test_a_run_writes_its_page_beside_the_tables(toy_run):
-    assert write_page(toy_run) == [toy_run / "report.html"]
-    assert Page(toy_run / "report.html").data["methods"] == ["toy", "failing"]
+    folder = RunFolder(toy_run)
+    clips = {clip.subject: clip for clip in open_run_clips(toy_run, RunOptions(trust=True))[1]}
+    run = FinishedRun(folder, folder.read_manifest(), Rows.read(folder.rows), clips)
+    assert write_page(run) == [folder.page]
+    assert Page(folder.page).data["methods"] == ["toy", "failing"]
 
 
 def test_a_card_has_the_citation_of_the_registered_method(page, write_run, change_manifest):

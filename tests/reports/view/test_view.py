@@ -138,7 +138,7 @@ def test_an_avatar_of_a_run_is_shown_alone(run, tmp_path):
 def test_what_is_not_trained_is_named(run, tmp_path):
     shutil.copytree(run.root, tmp_path / "out")
     shutil.copytree(run.root.parent / "data", tmp_path / "data")
-    (tmp_path / "out" / "901" / "gbs" / "seed-0" / "fit.json").unlink()
+    (tmp_path / "out" / "901" / "gbs" / "seed-0" / "cell.json").unlink()
     (tmp_path / "out" / "901" / "ga" / "seed-0" / "avatar" / "head_model.npz").write_bytes(b"")
     with pytest.raises(
         InputError, match="ga, subject 901, seed 0: .*head_model.npz.*gbs, subject 901, seed 0: not trained"
@@ -159,7 +159,7 @@ def test_what_is_not_trained_is_named(run, tmp_path):
         ({"methods": ("nobody",)}, "--methods.*mean-image, ga, gbs.*nobody"),
         ({"subjects": ("902",)}, "--subjects.*901.*902"),
         ({"avatars": ("nowhere",)}, "no such folder"),
-        ({"data": "nowhere"}, "no such folder"),
+        ({"data": "nowhere"}, "found nothing there"),
         ({"source": "nowhere"}, "no such folder"),
     ],
 )
