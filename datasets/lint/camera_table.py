@@ -12,19 +12,21 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
 
-from ...bench.contracts import Camera, FloatArray, Progress
+from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.protocol import evenly_with_ends
-from ..ga.layout import CyConvention
 from ..ga.transforms import FrameEntry
 from ..head.geometry import project, vertex_normals
-from .mesh import Parameters, TrackedSubject
-from .views import BLANK_LEVELS, Pixels, entry_camera, structure
+from .mesh import TrackedSubject
+from .views import BLANK_LEVELS, structure
+
+if TYPE_CHECKING:
+    from .evidence import Evidence
 
 WORKING_HEIGHT = 400
 """Maximum height of compared images, pixels."""
@@ -59,55 +61,36 @@ _CANDIDATES = 6
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """Measurements of one camera; NaN if not available.
-
-    Attributes
-    ----------
-    level : float
-        Mean grey level, 0 to 255.
-    contrast : float
-        Largest `structure` of its images, grey levels: about 0 for images of one colour.
-    motion : float
-        Largest `structure` of the difference of two of its images, grey levels: about 0 for a frozen
-        image.
-    match : float
-        Correlation, -1 to 1, of the face's brightness with the other cameras', at the best offset.
-    offset : tuple[float, float]
-        (2,) pixels right and down from the projected face to the face in the image.
-    metres_per_pixel, degrees_per_pixel : float
-        Pixel size at the head's distance.
-    height, scale : int, float
-        Image height in pixels, and its ratio to the height of the images measured.
-    lag : int
-        Frames by which its images are late (positive) or early, whole.
-    unsteady, unsteady_at_lag : float
-        Median distance in pixels of the offsets over time from their median, without a lag and with
-        it.
-    sharpness : float
-        log2 of the contrast of fine details of the face relative to the other cameras.
-    fits : str
-        If its own calibration is in doubt, the camera whose calibration matches the images better,
-        otherwise "".
-    fits_match : float
-        Correlation under that calibration.
-    """
+    """Measurements of one camera; NaN if not available."""
 
     frames: int
     level: float
+    """Mean grey level, 0 to 255."""
     contrast: float
+    """Largest `structure` of its images, grey levels: about 0 for images of one colour."""
     motion: float
+    """Largest `structure` of the difference of two of its images, grey levels: about 0 for a frozen image."""
     match: float = np.nan
+    """Correlation, -1 to 1, of the face's brightness with the other cameras', at the best offset."""
     offset: tuple[float, float] = (np.nan, np.nan)
+    """(2,) pixels right and down from the projected face to the face in the image."""
     metres_per_pixel: float = np.nan
     degrees_per_pixel: float = np.nan
+    """Pixel size at the head's distance, in both units."""
     height: int = 0
     scale: float = 1.0
+    """Image height in pixels, and its ratio to the height of the images measured."""
     lag: int = 0
+    """Frames by which its images are late (positive) or early, whole."""
     unsteady: float = np.nan
     unsteady_at_lag: float = np.nan
+    """Median distance in pixels of the offsets over time from their median, without a lag and with it."""
     sharpness: float = np.nan
+    """log2 of the contrast of fine details of the face relative to the other cameras."""
     fits: str = ""
+    """If its own calibration is in doubt, the camera whose calibration matches the images better, otherwise ""."""
     fits_match: float = np.nan
+    """Correlation under that calibration."""
 
 
 class _Shot(NamedTuple):
@@ -130,33 +113,25 @@ class _Picked(NamedTuple):
     smooth: FloatArray  # the image
 
 
-def measure_cameras(
-    entries: Sequence[FrameEntry],
-    pixels: Pixels,
-    subject: TrackedSubject | None,
-    parameters: Mapping[int, Parameters],
-    cy: CyConvention,
-    *,
-    timesteps: int,
-    progress: Progress,
-) -> dict[str, CameraFacts]:
+def measure_cameras(evidence: Evidence, timesteps: int) -> dict[str, CameraFacts]:
     """Measure every camera on up to ``timesteps`` timesteps: those in which the head moves most, spread over time."""
+    entries = [entry for split in evidence.imaged.values() for entry in split]
     cameras = sorted({entry.camera_id for entry in entries})
-    chosen = _pick_timesteps(entries, subject, parameters, timesteps)
+    chosen = _pick_timesteps(evidence, entries, timesteps)
     wanted = [entry for entry in entries if entry.timestep in chosen]
     shots: dict[str, dict[int, _Shot]] = {camera: {} for camera in cameras}
     for done, entry in enumerate(wanted, start=1):
-        progress(done, len(wanted), "measuring cameras")
+        evidence.progress(done, len(wanted), "measuring cameras")
         try:
-            shot = _shoot(entry, pixels, cy)
+            shot = _shoot(evidence, entry)
         except InputError:
             continue  # reported as a damaged file
         shots[entry.camera_id].setdefault(entry.timestep, shot)
     facts = {camera: _plain([*taken.values()]) for camera, taken in shots.items() if taken}
     live = [c for c, f in facts.items() if f.contrast >= BLANK_LEVELS and c not in frozen(facts)]
-    if subject is None or len(live) < FEWEST_CAMERAS or not any(_posed(parameters, t) for t in chosen):
+    if evidence.subject is None or len(live) < FEWEST_CAMERAS or not any(map(evidence.pose, chosen)):
         return facts
-    table = _Table(subject, parameters, {camera: shots[camera] for camera in live}, chosen)
+    table = _Table(evidence, evidence.subject, {camera: shots[camera] for camera in live}, chosen)
     compared = {camera: table.compared(camera, facts[camera], live) for camera in live}
     doubted = _doubted(compared)
     trusted = [camera for camera in live if camera not in doubted]
@@ -194,12 +169,7 @@ def _doubted(facts: Mapping[str, CameraFacts]) -> list[str]:
     ]
 
 
-def _pick_timesteps(
-    entries: Sequence[FrameEntry],
-    subject: TrackedSubject | None,
-    parameters: Mapping[int, Parameters],
-    count: int,
-) -> dict[int, list[int]]:
+def _pick_timesteps(evidence: Evidence, entries: Sequence[FrameEntry], count: int) -> dict[int, list[int]]:
     """Timesteps to measure and, for each lag from -`MAX_LAG` to `MAX_LAG`, the timesteps of the poses.
 
     From each of ``count`` equal parts of the capture, the timestep with the fastest head motion is selected.
@@ -211,34 +181,28 @@ def _pick_timesteps(
     for present in sequences.values():
         for timestep in present:
             steps = [timestep - lag for lag in range(-MAX_LAG, MAX_LAG + 1)]
-            around[timestep] = [t if t in present and _posed(parameters, t) else -1 for t in steps]
+            around[timestep] = [t if t in present and evidence.pose(t) else -1 for t in steps]
     chosen = []
     for part in np.array_split(sorted(around), max(1, min(count, len(around)))):
         if len(part):
             few = evenly_with_ends(part.tolist(), _CANDIDATES)
-            chosen.append(max(few, key=lambda t: _speed(subject, parameters, around[t])))
+            chosen.append(max(few, key=lambda t: _speed(evidence, around[t])))
     return {timestep: around[timestep] for timestep in chosen}
 
 
-def _posed(parameters: Mapping[int, Parameters], timestep: int) -> bool:
-    return timestep in parameters and parameters[timestep].pose is not None
-
-
-def _speed(
-    subject: TrackedSubject | None, parameters: Mapping[int, Parameters], around: Sequence[int]
-) -> float:
+def _speed(evidence: Evidence, around: Sequence[int]) -> float:
     """Mean motion of vertices over the timesteps around each one, metres; -1 at the ends of a sequence."""
     before, after = around[MAX_LAG + 1], around[MAX_LAG - 1]
-    if subject is None or before < 0 or after < 0:
+    if evidence.subject is None or before < 0 or after < 0:
         return -1.0
-    poses = [p for p in (parameters[before].pose, parameters[after].pose) if p is not None]
-    one, other = subject.meshes(poses)
+    poses = [pose for pose in (evidence.pose(before), evidence.pose(after)) if pose is not None]
+    one, other = evidence.subject.meshes(poses)
     return float(np.linalg.norm(one - other, axis=1).mean())
 
 
-def _shoot(entry: FrameEntry, pixels: Pixels, cy: CyConvention) -> _Shot:
-    image, mask = pixels.image(entry), pixels.mask(entry)
-    camera = entry_camera(entry, pixels.headers[entry.image], cy)
+def _shoot(evidence: Evidence, entry: FrameEntry) -> _Shot:
+    image, mask = evidence.pixels.image(entry), evidence.pixels.mask(entry)
+    camera = evidence.camera(entry)
     scale = min(1.0, WORKING_HEIGHT / camera.height)
     size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
     grey = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32).mean(axis=2)
@@ -271,8 +235,8 @@ class _Table:
 
     def __init__(
         self,
+        evidence: Evidence,
         subject: TrackedSubject,
-        parameters: Mapping[int, Parameters],
         shots: Mapping[str, Mapping[int, _Shot]],
         around: Mapping[int, Sequence[int]],
     ) -> None:
@@ -281,7 +245,7 @@ class _Table:
         self.shots = {c: {t: s for t, s in taken.items() if t in posed} for c, taken in shots.items()}
         self.shots = {camera: taken for camera, taken in self.shots.items() if taken}
         needed = sorted({t for steps in self.around.values() for t in steps if t >= 0})
-        poses = [parameters[t].pose for t in needed]
+        poses = [evidence.pose(t) for t in needed]
         meshes = dict(zip(needed, subject.meshes([pose for pose in poses if pose is not None])))
         self.points = {t: mesh[self.members] for t, mesh in meshes.items()}
         self.normals = {t: vertex_normals(meshes[t], subject.head.faces)[self.members] for t in self.around}

@@ -12,8 +12,8 @@ from ...bench.io.files import entries
 from ...bench.progress import counted
 from ..ga import layout
 from ..ga.transforms import FrameEntry
+from .checks_cameras import dead_cameras
 from .checks_images import unit_range
-from .checks_rig import dead_cameras
 from .evidence import Evidence, Slot
 from .rules import Hit, at, rule, some, spans
 from .views import Thumbnail, near_duplicates
@@ -42,7 +42,7 @@ def _refused(evidence: Evidence) -> Iterator[Hit]:
     Fix the other findings first; `headbench run` stops at this one.
     """
     # Faults reported by another rule are skipped (see `apply` for those at the same place).
-    error = evidence.refusal
+    error = evidence.faults[0].error if evidence.faults else None
     reported = not {"HB103", "HB116"} & {*evidence.settings.ignore}
     missing = error is not None and any(str(fault.file) in error.found for fault in evidence.file_faults)
     missing = missing and reported
@@ -57,7 +57,7 @@ def _broken_json(evidence: Evidence) -> Iterator[Hit]:
 
     Export the capture again, or restore the file.
     """
-    yield from _faults((*evidence.json_faults, *evidence.declaration_faults), "file")
+    yield from _faults([*evidence.faults.errors("json"), *evidence.faults.errors("declaration")], "file")
 
 
 @rule("HB102", "error", of_layout=True, refused=True)
@@ -66,8 +66,8 @@ def _broken_frame(evidence: Evidence) -> Iterator[Hit]:
 
     Export the capture again, or fix the entry.
     """
-    others = [error for error in evidence.frame_faults if not error.key.endswith(".transform_matrix")]
-    yield from _faults(others, "frame")
+    errors = evidence.faults.errors("frame")
+    yield from _faults((e for e in errors if not e.key.endswith(".transform_matrix")), "frame")
 
 
 @rule("HB103", "error")
@@ -100,13 +100,13 @@ def _missing_file(evidence: Evidence) -> Iterator[Hit]:
 
 def _absolute_elsewhere(evidence: Evidence) -> dict[str, tuple[FrameEntry, str]]:
     """Missing files with absolute paths, with the frame and the key that name them."""
-    found: dict[str, tuple[FrameEntry, str]] = {}
+    places: dict[str, tuple[FrameEntry, str]] = {}
     for entry in evidence.entries:
         named = {"file_path": entry.image, "fg_mask_path": entry.mask, "flame_param_path": entry.parameters}
         for key, path in named.items():
             if path is not None and not path.is_relative_to(entry.file.parent) and not os.path.exists(path):
-                found.setdefault(str(path), (entry, key))
-    return found
+                places.setdefault(str(path), (entry, key))
+    return places
 
 
 @rule("HB116", "error", of_layout=True, refused=True)
@@ -116,11 +116,11 @@ def _absolute_paths(evidence: Evidence) -> Iterator[Hit]:
     Write paths relative to the folder of the JSON, such as ../SEQUENCE/images/00000_00.png, which stay valid when the
     export is copied.
     """
-    found = _absolute_elsewhere(evidence)
-    if found:
-        path, (entry, key) = next(iter(found.items()))
+    places = _absolute_elsewhere(evidence)
+    if places:
+        path, (entry, key) = next(iter(places.items()))
         yield Hit(
-            f"{counted(len(found), 'file')} named by absolute paths that this machine does not have, such as {path}",
+            f"{counted(len(places), 'file')} named by absolute paths that this machine does not have, such as {path}",
             *at(entry, key),
         )
 
@@ -138,14 +138,14 @@ def _wrong_size(evidence: Evidence) -> Iterator[Hit]:
             info = evidence.headers.get(path) if path is not None else None
             if info is None or image is None:
                 continue
-            expected = (entry.width or image.width, entry.height or image.height)
-            if (info.width, info.height) != expected:
-                wrong.append((path, (info.width, info.height), expected, entry))
+            stated = (entry.width or image.width, entry.height or image.height)
+            if (info.width, info.height) != stated:
+                wrong.append((path, (info.width, info.height), stated, entry))
     if wrong:
-        path, found, expected, entry = wrong[0]
+        path, size, stated, entry = wrong[0]
         yield Hit(
-            f"{counted(len(wrong), 'file')} of another size than stated: {found[0]}x{found[1]} pixels where "
-            f"{entry.where} of {entry.file.name} says {expected[0]}x{expected[1]}",
+            f"{counted(len(wrong), 'file')} of another size than stated: {size[0]}x{size[1]} pixels where "
+            f"{entry.where} of {entry.file.name} says {stated[0]}x{stated[1]}",
             path or "",
         )
 
@@ -212,8 +212,8 @@ def _stray_exclusion(evidence: Evidence) -> Iterator[Hit]:
     """
     if evidence.declaration is None:
         return
-    known = {e.timestep for e in evidence.entries} | {slot.timestep for slot in evidence.unread}
-    stray = sorted(set(evidence.declaration.excluded) - known)
+    timesteps = {e.timestep for e in evidence.entries} | {slot.timestep for slot in evidence.unread}
+    stray = sorted(set(evidence.declaration.excluded) - timesteps)
     if stray:
         file = evidence.folder / layout.DECLARATION_FILE
         yield Hit(f"timesteps {spans(stray)} are excluded and not in the capture", file, "excluded")
@@ -265,7 +265,7 @@ def _empty_split(evidence: Evidence) -> Iterator[Hit]:
     """
     cameras = {entry.camera_id for part in evidence.splits.values() for entry in part}
     needed = [name for name in layout.SPLIT_FILES if name != "novel_view" or len(cameras) > 1]
-    faulty = {error.file for error in (*evidence.json_faults, *evidence.frame_faults)}
+    faulty = {error.file for error in evidence.faults.errors("json", "frame")}
     files = {name: evidence.split_file(name) for name in needed}
     empty = [
         name for name, path in files.items() if not evidence.splits.get(name) and str(path) not in faulty
@@ -281,7 +281,7 @@ def _undeclared(evidence: Evidence) -> Iterator[Hit]:
     Write headbench.json beside the JSONs (its keys are listed in the documentation under "Captures and head models"), so that
     nothing has to be inferred.
     """
-    if evidence.declaration is None and not evidence.declaration_faults:
+    if evidence.declaration is None and not evidence.faults.errors("declaration"):
         yield Hit(
             "no declaration of background, head model, principal point and sequence names: white, the given "
             "head, the images' own evidence and the folders' names are taken",
@@ -298,15 +298,15 @@ def _orphans(evidence: Evidence) -> Iterator[Hit]:
     named = {entry.image for entry in evidence.entries}
     folders = {entry.image.parent for entry in evidence.entries}
     # Frames that do not parse refer to unknown images.
-    if evidence.unread or evidence.frame_faults or evidence.json_faults:
+    if evidence.faults.errors("json", "frame"):
         return
-    known = {path.resolve() for path in named}
+    resolved = {path.resolve() for path in named}
     orphans = sorted(
         path
         for folder in folders
         if folder.is_dir()
         for path in entries(folder)
-        if path.suffix.lower() in IMAGE_SUFFIXES and path.resolve() not in known
+        if path.suffix.lower() in IMAGE_SUFFIXES and path.resolve() not in resolved
     )
     if orphans:
         yield Hit(f"{counted(len(orphans), 'image')} that no split names", orphans[0])

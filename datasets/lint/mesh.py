@@ -1,58 +1,27 @@
-"""Tracked parameters read file by file, and the tracked mesh compared with a frame: position, orientation, silhouette,
-skin."""
+"""The tracked mesh compared with frames: position, orientation, silhouette, skin, and whether expressions explain colours."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray, Progress, no_progress
+from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
 from ...bench.errors import InputError
-from ...bench.io.arrays import read_npz
-from ..ga.tracking import Tracking, read_tracking
-from ..ga.transforms import FrameEntry
-from ..head.arrays import HeadArrays
-from ..head.geometry import project, rigid_alignment
+from ...bench.protocol import evenly_with_ends
+from ..ga.tracking import Tracking
+from ..head.geometry import project, rigid_alignment, vertex_normals
 from ..head.subject import PosedSubject
 from ..mesh_pictures import rasterize_mesh
 
-OFFSETS = ("static_offset", "dynamic_offset")
-"""Arrays with a row per vertex; too large to keep for every timestep."""
-
-
-@dataclass(frozen=True, eq=False)
-class Parameters:
-    """One parameter file.
-
-    Attributes
-    ----------
-    arrays : Mapping[str, np.ndarray]
-        Stored arrays without the per-vertex `OFFSETS`; empty if the file cannot be read.
-    not_finite : tuple[str, ...]
-        Names of arrays with NaN or infinite numbers.
-    offset_change_m : float
-        Largest difference of its static offset from the first file's; 0 without one.
-    dynamic_m : float
-        Largest entry of its dynamic offset; 0 without one.
-    pose : HeadPose | None
-        None if the head is unknown or the arrays do not fit it.
-    error : InputError | None
-        Why there is no pose.
-    """
-
-    timestep: int
-    path: Path
-    arrays: Mapping[str, np.ndarray]
-    not_finite: tuple[str, ...] = ()
-    offset_change_m: float = 0.0
-    dynamic_m: float = 0.0
-    pose: HeadPose | None = None
-    error: InputError | None = None
+if TYPE_CHECKING:
+    from .evidence import Evidence
+    from .views import ViewFacts
 
 
 class TrackedSubject(PosedSubject):
@@ -68,71 +37,6 @@ class TrackedSubject(PosedSubject):
         regions = self.head.regions
         inner = [regions.get(name, np.empty(0, np.int64)) for name in INNER]
         return np.setdiff1d(regions.get("face", np.arange(len(self.head.template))), np.concatenate(inner))
-
-
-def read_parameters(
-    entries: Sequence[FrameEntry], head: HeadArrays | None, *, progress: Progress = no_progress
-) -> tuple[dict[int, Parameters], TrackedSubject | None]:
-    """Parameters by timestep (of its first frame), and the head and identity that they fit."""
-    files: dict[int, Path] = {}
-    for entry in entries:
-        files.setdefault(entry.timestep, entry.parameters)
-    found: dict[int, Parameters] = {}
-    subject: TrackedSubject | None = None
-    first_offset: np.ndarray | None = None
-    for done, (timestep, path) in enumerate(sorted(files.items()), start=1):
-        progress(done, len(files), "reading parameters")
-        try:
-            arrays = read_npz(path)
-        except InputError as error:
-            found[timestep] = Parameters(timestep, path, {}, error=error)
-            continue
-        offset = _numbers(arrays.get("static_offset"))
-        if first_offset is None:
-            first_offset = offset
-        pose = fault = None
-        if head is not None:
-            try:
-                tracking = read_tracking(
-                    {timestep: path},
-                    subject.head if subject else head,
-                    "",
-                    teeth="keep" if subject else "auto",
-                )
-                pose = tracking.poses[timestep]
-                subject = subject or TrackedSubject(tracking)
-            except InputError as error:
-                fault = error
-        found[timestep] = Parameters(
-            timestep=timestep,
-            path=path,
-            arrays={name: array for name, array in arrays.items() if name not in OFFSETS},
-            not_finite=not_finite(arrays),
-            offset_change_m=_largest(offset - first_offset) if offset.shape == first_offset.shape else 0.0,
-            dynamic_m=_largest(_numbers(arrays.get("dynamic_offset"))),
-            pose=pose,
-            error=fault,
-        )
-    return found, subject
-
-
-def not_finite(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
-    """Names of the arrays with NaN or infinite numbers."""
-    return tuple(name for name, array in arrays.items() if not _is_finite(array))
-
-
-def _numbers(array: np.ndarray | None) -> np.ndarray:
-    """The array if its numbers are finite, else an empty one."""
-    usable = array is not None and array.dtype.kind in "fiu" and _is_finite(array)
-    return array if array is not None and usable else np.empty(0)
-
-
-def _is_finite(array: np.ndarray) -> bool:
-    return array.dtype.kind not in "f" or bool(np.isfinite(array).all())
-
-
-def _largest(array: np.ndarray) -> float:
-    return float(np.abs(array).max(initial=0.0))
 
 
 FACE = ("face", "forehead", "nose")
@@ -155,48 +59,33 @@ FAR = 0.2
 
 @dataclass(frozen=True, eq=False)
 class MeshFacts:
-    """The posed mesh of one frame relative to its camera.
-
-    Attributes
-    ----------
-    vertices : FloatArray
-        (V, 3) in the world of the frame's sequence, metres.
-    camera : Camera
-        Camera of the frame, at the image's size.
-    distance : float
-        Distance from the camera to the mesh's centre, metres.
-    depth : float
-        Depth of that centre along the viewing direction; negative behind the camera.
-    upright : float
-        Cosine of the angle between the upward directions of image and head.
-    facing : float
-        Cosine of the angle between the face's direction and the direction from head to camera.
-    face_outside : float | None
-        Fraction of the face's vertices outside of the foreground; None without a mask.
-    overlap : float | None
-        Intersection over union of mesh and foreground; None without a mask.
-    size : float | None
-        Area of the mesh divided by that of the foreground; None without a mask.
-    far : float | None
-        Fraction of the foreground that is farther from the mesh than `FAR`; None without a mask.
-    skin : FloatArray | None
-        Median colour (3,) of the face's visible skin, 8-bit levels; None if little of it is visible.
-    """
+    """The posed mesh of one frame relative to its camera."""
 
     vertices: FloatArray
+    """(V, 3) in the world of the frame's sequence, metres."""
     camera: Camera
+    """Camera of the frame, at the image's size."""
     distance: float
+    """Distance from the camera to the mesh's centre, metres."""
     depth: float
+    """Depth of that centre along the viewing direction; negative behind the camera."""
     upright: float
+    """Cosine of the angle between the upward directions of image and head."""
     facing: float
+    """Cosine of the angle between the face's direction and the direction from head to camera."""
     face_outside: float | None = None
+    """Fraction of the face's vertices outside of the foreground; this and the next three are None without a mask."""
     overlap: float | None = None
+    """Intersection over union of mesh and foreground."""
     size: float | None = None
+    """Area of the mesh divided by that of the foreground."""
     far: float | None = None
+    """Fraction of the foreground that is farther from the mesh than `FAR`."""
     skin: FloatArray | None = None
+    """Median colour (3,) of the face's visible skin, 8-bit levels; None if little of it is visible."""
 
 
-def lay_mesh(
+def compare_mesh(
     subject: TrackedSubject, pose: HeadPose, camera: Camera, image: ByteArray, mask: ByteArray | None
 ) -> MeshFacts:
     """Pose the subject's mesh and compare it with an image, (H, W, 3) RGB, and its mask, (H, W)."""
@@ -218,7 +107,7 @@ def lay_mesh(
     )
     if plain.depth <= 0:
         return plain
-    return _held_against(plain, subject, image, mask)
+    return _compare_mask(plain, subject, image, mask)
 
 
 def _members(subject: TrackedSubject, names: tuple[str, ...]) -> IntArray:
@@ -227,7 +116,7 @@ def _members(subject: TrackedSubject, names: tuple[str, ...]) -> IntArray:
     return np.unique(np.concatenate(regions)) if regions else np.arange(len(subject.head.template))
 
 
-def _held_against(
+def _compare_mask(
     plain: MeshFacts, subject: TrackedSubject, image: ByteArray, mask: ByteArray | None
 ) -> MeshFacts:
     camera, vertices = plain.camera, plain.vertices
@@ -287,3 +176,129 @@ def _face_outside(
     rows = np.flatnonzero(filled.any(axis=1))
     slack = SLACK * (rows[-1] - rows[0] + 1) if len(rows) else 0.0
     return float((distance[row[inside], column[inside]] > slack).mean())
+
+
+FRAMES = 16
+"""Frames to judge by."""
+
+FEWEST_FRAMES, FEWEST_VERTICES = 6, 50
+"""Minimum amount of data for a result."""
+
+EXPRESSION_FACING = 0.5
+"""Minimum cosine between a vertex's normal and the direction to the camera."""
+
+MOVES_PX = 0.5
+"""Minimum motion of a vertex's projection by expression, for vertices that are compared."""
+
+
+class ExpressionFit(NamedTuple):
+    """Ratio of the variances over time of the face's colours with the expression and with a face at rest.
+
+    ``mean`` and ``median`` compare the mean and the median over ``vertices`` vertices in ``frames`` frames of
+    ``camera``: below 1 if the expression explains the images.
+    """
+
+    camera: str
+    frames: int
+    vertices: int
+    mean: float
+    median: float
+
+    @property
+    def ratio(self) -> float:
+        """Geometric mean of both: the mean is dominated by the few vertices that move much, the median by the others."""
+        return math.sqrt(self.mean * self.median)
+
+
+@dataclass(frozen=True, eq=False)
+class _FaceColours:
+    """Colours that the face's vertices have in one frame."""
+
+    colours: FloatArray  # (F, 3)
+    seen: np.ndarray  # (F,)
+    pixels: FloatArray  # (F, 2)
+
+
+def weigh_expression(evidence: Evidence) -> ExpressionFit | None:
+    """Compare the expression with a face at rest in the most frontal camera of the views; None if there are too few data."""
+    subject, camera = evidence.subject, _facing_camera(evidence.views)
+    if subject is None or camera is None:
+        return None
+    poses = {entry: evidence.pose(entry.timestep) for split in evidence.imaged.values() for entry in split}
+    usable = sorted(
+        (entry for entry, pose in poses.items() if entry.camera_id == camera and pose is not None),
+        key=lambda entry: entry.timestep,
+    )
+    moving: list[_FaceColours] = []
+    resting: list[_FaceColours] = []
+    for entry in evenly_with_ends(usable, FRAMES):
+        pose = poses[entry]
+        if pose is None:
+            continue
+        try:
+            image = evidence.pixels.image(entry)
+        except InputError:
+            continue  # reported as a damaged file
+        still = replace(pose, expression=np.zeros_like(pose.expression))
+        for samples, vertices in zip((moving, resting), subject.meshes([pose, still])):
+            samples.append(_face_colours(vertices, subject, evidence.camera(entry), image))
+    return _compare(camera, moving, resting)
+
+
+def _facing_camera(views: Sequence[ViewFacts]) -> str | None:
+    facing: dict[str, list[float]] = {}
+    for view in views:
+        if view.mesh is not None and view.mesh.depth > 0:
+            facing.setdefault(view.entry.camera_id, []).append(view.mesh.facing)
+    return max(facing, key=lambda name: float(np.median(facing[name]))) if facing else None
+
+
+def _face_colours(
+    vertices: FloatArray, subject: TrackedSubject, camera: Camera, image: ByteArray
+) -> _FaceColours:
+    points = vertices[subject.skin]
+    outward = vertex_normals(vertices, subject.head.faces)[subject.skin]
+    towards = camera.center - points
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    pixels = project(points, camera)
+    where = (pixels - 0.5).astype(np.float32)  # OpenCV's pixel centres are at integers
+    sampled = cv2.remap(image.astype(np.float32), where[:, :1], where[:, 1:], cv2.INTER_LINEAR)
+    colours = sampled[:, 0].astype(np.float64)
+    within = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    return _FaceColours(colours, ((outward * towards).sum(axis=1) > EXPRESSION_FACING) & within, pixels)
+
+
+def _compare(
+    camera: str, moving: Sequence[_FaceColours], resting: Sequence[_FaceColours]
+) -> ExpressionFit | None:
+    if len(moving) < FEWEST_FRAMES:
+        return None
+    # Only vertices visible in both are compared.
+    seen = np.array([one.seen & other.seen for one, other in zip(moving, resting)])
+    moved = np.array(
+        [np.linalg.norm(one.pixels - other.pixels, axis=1) for one, other in zip(moving, resting)]
+    )
+    telling = (seen.sum(axis=0) >= FEWEST_FRAMES) & (moved.max(axis=0) >= MOVES_PX)
+    if telling.sum() < FEWEST_VERTICES:
+        return None
+    ours = _variance(moving, seen)[telling]
+    rest = _variance(resting, seen)[telling]
+    if rest.mean() <= 0 or np.median(rest) <= 0:
+        return None  # a face of one colour
+    return ExpressionFit(
+        camera,
+        len(moving),
+        int(telling.sum()),
+        float(ours.mean() / rest.mean()),
+        float(np.median(ours) / np.median(rest)),
+    )
+
+
+def _variance(picked: Sequence[_FaceColours], seen: np.ndarray) -> FloatArray:
+    """(F,) variance of each vertex's colour over the frames in which it is visible, mean over channels."""
+    weight = seen[..., None].astype(np.float64)
+    colours = np.array([one.colours for one in picked])
+    count = np.maximum(weight.sum(axis=0), 1)
+    mean = (colours * weight).sum(axis=0) / count
+    variance: FloatArray = ((((colours - mean) ** 2) * weight).sum(axis=0) / count).mean(axis=1)
+    return variance

@@ -7,21 +7,21 @@ image changes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray, Camera, FloatArray, Progress, no_progress
+from ...bench.contracts import ByteArray, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.images import ImageInfo
-from ..ga.layout import CyConvention, extrinsics_from_json, intrinsics_from_json
 from ..ga.transforms import FrameEntry
-from ..images import read_image, read_mask
-from .mesh import MeshFacts, Parameters, TrackedSubject, lay_mesh
+from .mesh import MeshFacts, compare_mesh
+
+if TYPE_CHECKING:
+    from .evidence import Evidence
 
 BACKGROUND_LEVELS = 12
 """Maximum difference of any channel of background pixels; JPEG changes flat areas by less."""
@@ -43,77 +43,89 @@ SOFT = (0.25, 0.75)
 
 MIN_FRINGE_PIXELS = 12
 
+BLANK_COVERAGE = 0.001
+
+MASK_LEVELS = (12, 240)
+"""Maximum level of what is outside a mask, and minimum level of what is inside."""
+
 
 @dataclass(frozen=True, eq=False)
 class MaskFacts:
-    """Facts on a frame's mask, and on the image outside of the subject.
-
-    Attributes
-    ----------
-    outside : FloatArray | None
-        Median colour (3,) far from the foreground, 8-bit levels; None if there are no such pixels.
-    outside_off : float
-        Fraction of those pixels that differ from the declared background.
-    inside_empty : float
-        Fraction of the foreground that has the background's colour.
-    fringe : float | None
-        Median over soft pixels of (I - (1-a) B) / (a F), the subject's measured contribution to the
-        image over the expected one, with F the mean colour of the covered pixels nearby; 1 for a
-        clean straight-alpha composite, a (0.5) for one premultiplied twice. None with too few soft
-        pixels.
-    """
+    """Facts on a frame's mask, and on the image outside of the subject."""
 
     low: int
     high: int
     coverage: float
     outside: FloatArray | None
+    """Median colour (3,) far from the foreground, 8-bit levels; None if there are no such pixels."""
     outside_off: float
+    """Fraction of those pixels that differ from the declared background."""
     inside_empty: float
+    """Fraction of the foreground that has the background's colour."""
     fringe: float | None
+    """Median over soft pixels of (I - (1-a) B) / (a F), the subject's measured contribution to the image over the
+    expected one, with F the mean colour of the covered pixels nearby; 1 for a clean straight-alpha composite, a (0.5) for
+    one premultiplied twice. None with too few soft pixels."""
+
+    @property
+    def other_levels(self) -> bool:
+        """Whether nothing is covered fully, or everything a little."""
+        return 0 < self.high < MASK_LEVELS[1] or MASK_LEVELS[0] < self.low <= 127
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is covered."""
+        return self.coverage < BLANK_COVERAGE and not self.other_levels
+
+    @property
+    def full(self) -> bool:
+        """Whether everything is covered."""
+        return self.low > 127
+
+    @property
+    def inverted(self) -> bool:
+        """Whether the background is covered."""
+        return not self.full and self.inside_empty > 0.5 and self.outside_off > 0.3
+
+    @property
+    def sound(self) -> bool:
+        """Whether it has none of these faults."""
+        return not (self.other_levels or self.empty or self.full or self.inverted)
 
 
 @dataclass(frozen=True, eq=False)
 class ViewFacts:
-    """Facts on one decoded frame.
-
-    Attributes
-    ----------
-    low, high : int
-        Minimum and maximum level of any pixel's channels.
-    subject_low, subject_high : int
-        The same over pixels fully covered by the subject.
-    corners : FloatArray | None
-        Median colour (3,) of the upper corners.
-    corners_off : float
-        Fraction of their pixels that differ from the declared background.
-    room : bool
-        Whether these pixels have several colours, as if a room is shown and no background was set.
-    blank : bool
-        Whether its pixels (the subject's if there is a mask) have no more contrast than noise.
-    has_alpha : bool
-        Whether the image has an alpha channel, which then is its mask.
-    mask : MaskFacts | None
-        None without a mask, or if it cannot be decoded or has another size.
-    mesh : MeshFacts | None
-        None if the frame has no pose or no head.
-    error : InputError | None
-        Why the image cannot be decoded; all other fields are then empty.
-    """
+    """Facts on one decoded frame."""
 
     entry: FrameEntry
     low: int = 0
     high: int = 0
+    """Minimum and maximum level of any pixel's channels."""
     subject_low: int = 0
     subject_high: int = 0
+    """Minimum and maximum over pixels fully covered by the subject."""
     grey: bool = False
     corners: FloatArray | None = None
+    """Median colour (3,) of the upper corners."""
     corners_off: float = 0.0
+    """Fraction of their pixels that differ from the declared background."""
     room: bool = False
+    """Whether these pixels have several colours, as if a room is shown and no background was set."""
     blank: bool = False
+    """Whether its pixels (the subject's if there is a mask) have no more contrast than noise."""
     has_alpha: bool = False
+    """Whether the image has an alpha channel, which then is its mask."""
     mask: MaskFacts | None = None
+    """None without a mask, or if it cannot be decoded or has another size."""
     mesh: MeshFacts | None = None
+    """None if the frame has no pose or no head."""
     error: InputError | None = None
+    """Why the image cannot be decoded; all other fields are then empty."""
+
+    @property
+    def has_sound_mask(self) -> bool:
+        """Whether it has a mask that the geometry can be compared with."""
+        return self.mask is not None and self.mask.sound
 
 
 def pick_views(entries: Sequence[FrameEntry], count: int) -> list[FrameEntry]:
@@ -130,73 +142,23 @@ def pick_views(entries: Sequence[FrameEntry], count: int) -> list[FrameEntry]:
     return list({id(entry): entry for entry in chosen}.values())
 
 
-def entry_camera(entry: FrameEntry, info: ImageInfo, cy: CyConvention) -> Camera:
-    """Camera of a frame from its entry, in the world of its sequence."""
-    intrinsics = intrinsics_from_json(entry.intrinsics, info.width, info.height, cy)
-    return Camera(
-        entry.camera_id, info.width, info.height, intrinsics, extrinsics_from_json(entry.camera_to_world)
-    )
-
-
-@dataclass(frozen=True)
-class Pixels:
-    """Source of the pixels of frames; both functions raise `InputError` for damaged files.
-
-    Attributes
-    ----------
-    headers : Mapping[Path, ImageInfo]
-        Headers of the existing images and masks, by path.
-    image : Callable
-        Function from a frame to its image (H, W, 3) on the background.
-    mask : Callable
-        Function from a frame to its mask (H, W); None without a mask of the image's size.
-    """
-
-    headers: Mapping[Path, ImageInfo]
-    image: Callable[[FrameEntry], ByteArray]
-    mask: Callable[[FrameEntry], ByteArray | None]
-
-
-def pixels_of_files(headers: Mapping[Path, ImageInfo], background: Sequence[float]) -> Pixels:
-    """Pixels of the files that the entries name."""
-    return Pixels(headers, lambda entry: read_image(entry.image, background), partial(_mask, headers))
-
-
-def inspect_views(
-    entries: Sequence[FrameEntry],
-    pixels: Pixels,
-    subject: TrackedSubject | None,
-    parameters: Mapping[int, Parameters],
-    background: Sequence[float],
-    cy: CyConvention,
-    *,
-    progress: Progress = no_progress,
-) -> list[ViewFacts]:
+def inspect_views(evidence: Evidence, entries: Sequence[FrameEntry]) -> list[ViewFacts]:
     """Decode frames and keep the facts needed by the checks, without the pixels."""
-    found = []
+    views = []
     for done, entry in enumerate(entries, start=1):
-        progress(done, len(entries), "looking at frames")
+        evidence.progress(done, len(entries), "looking at frames")
         try:
-            image, mask = pixels.image(entry), pixels.mask(entry)
+            image, mask = evidence.pixels.image(entry), evidence.pixels.mask(entry)
         except InputError as error:
-            found.append(ViewFacts(entry, error=error))
+            views.append(ViewFacts(entry, error=error))
             continue
-        info = pixels.headers[entry.image]
-        pose = parameters[entry.timestep].pose if entry.timestep in parameters else None
+        subject, pose = evidence.subject, evidence.pose(entry.timestep)
         mesh = None
         if subject is not None and pose is not None:
-            mesh = lay_mesh(subject, pose, entry_camera(entry, info, cy), image, mask)
-        found.append(_facts(entry, info, image, mask, mesh, background))
-    return found
-
-
-def _mask(headers: Mapping[Path, ImageInfo], entry: FrameEntry) -> ByteArray | None:
-    info = headers[entry.image]
-    path = entry.mask if entry.mask is not None else (entry.image if info.has_alpha else None)
-    header = headers.get(path) if path is not None else None
-    if path is None or header is None or (header.width, header.height) != (info.width, info.height):
-        return None
-    return read_mask(path, own=path == entry.image)
+            mesh = compare_mesh(subject, pose, evidence.camera(entry), image, mask)
+        info = evidence.headers[entry.image]
+        views.append(_facts(entry, info, image, mask, mesh, evidence.background))
+    return views
 
 
 def _facts(
@@ -289,49 +251,35 @@ _BLOCK = 2048
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """Thumbnail of a frame.
-
-    Attributes
-    ----------
-    grey : FloatArray
-        (SIDE, SIDE) float32 levels.
-    bits : FloatArray
-        (SIDE * (SIDE - 1),) float32, +1 where brightness increases to the right by more than a level,
-        else -1.
-    shown : np.ndarray
-        (SIDE, SIDE) bool, whether it differs from the upper corners.
-    """
+    """Thumbnail of a frame."""
 
     split: str
     entry: FrameEntry
     grey: FloatArray
+    """(SIDE, SIDE) float32 levels."""
     bits: FloatArray
+    """(SIDE * (SIDE - 1),) float32, +1 where brightness increases to the right by more than a level, else -1."""
     shown: np.ndarray
+    """(SIDE, SIDE) bool, whether it differs from the upper corners."""
 
 
-def make_thumbnails(
-    splits: Mapping[str, Sequence[FrameEntry]],
-    image_of: Callable[[FrameEntry], ByteArray],
-    limit: int,
-    *,
-    progress: Progress = no_progress,
-) -> list[Thumbnail]:
+def make_thumbnails(evidence: Evidence, limit: int) -> list[Thumbnail]:
     """Thumbnails of up to ``limit`` frames, an equal share of every split, evenly spaced in each."""
-    filled = {name: part for name, part in splits.items() if part}
+    splits = {name: entries for name, entries in evidence.imaged.items() if entries}
     chosen: list[tuple[str, FrameEntry]] = []
-    for left, name in zip(range(len(filled), 0, -1), sorted(filled, key=lambda name: len(filled[name]))):
-        part = filled[name]
-        count = min(len(part), max(0, limit - len(chosen)) // left)
-        chosen += [(name, part[i]) for i in np.unique(np.linspace(0, len(part) - 1, count).astype(int))]
-    found = []
+    for left, name in zip(range(len(splits), 0, -1), sorted(splits, key=lambda name: len(splits[name]))):
+        entries = splits[name]
+        count = min(len(entries), max(0, limit - len(chosen)) // left)
+        chosen += [(name, entries[i]) for i in np.unique(np.linspace(0, len(entries) - 1, count).astype(int))]
+    thumbnails = []
     for done, (name, entry) in enumerate(chosen, start=1):
-        progress(done, len(chosen), "comparing images")
+        evidence.progress(done, len(chosen), "comparing images")
         try:
-            image = image_of(entry)
+            image = evidence.pixels.image(entry)
         except InputError:
             continue  # damaged images are reported by other checks
-        found.append(_shrink(name, entry, image))
-    return found
+        thumbnails.append(_shrink(name, entry, image))
+    return thumbnails
 
 
 def _shrink(split: str, entry: FrameEntry, image: np.ndarray) -> Thumbnail:
