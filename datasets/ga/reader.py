@@ -115,7 +115,7 @@ def read_capture(
         progress=progress,
     )
     assert content.head is not None, "errors are raised"
-    tracking = read_tracking(content.parameters, content.head, content.subject, teeth=teeth)
+    tracking = read_tracking(content.parameter_files, content.head, content.subject, teeth=teeth)
     clip = build_clip(
         content,
         tracking,
@@ -150,10 +150,10 @@ class CaptureContent:
     @property
     def entries(self) -> list[FrameEntry]:
         """Frames of all splits."""
-        return [entry for part in self.splits.values() for entry in part]
+        return [entry for frames in self.splits.values() for entry in frames]
 
     @property
-    def parameters(self) -> dict[int, Path]:
+    def parameter_files(self) -> dict[int, Path]:
         """Parameter file of each timestep, of its first frame."""
         return {entry.timestep: entry.parameters for entry in reversed(self.entries)}
 
@@ -183,7 +183,7 @@ def read_content(
     with faults.of("declaration"):
         declaration = layout.Declaration.read(folder)
     splits = _read_splits(folder, resplit, faults)
-    entries = [entry for part in splits.values() for entry in part]
+    entries = [entry for frames in splits.values() for entry in frames]
     with faults.of("check"):
         check_timesteps(folder, entries)
     infos = check_images(entries, decode=decode, faults=faults, progress=progress)

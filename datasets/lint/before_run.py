@@ -9,7 +9,7 @@ from pathlib import Path
 from ...bench.contracts import Clip, HeadAsset, no_progress
 from ..clip import as_capture
 from .catalogue import RULES
-from .evidence import clip_evidence
+from .evidence import Evidence
 from .rules import Finding, apply
 from .settings import LintSettings
 
@@ -39,7 +39,7 @@ def errors(clip: Clip) -> list[str]:
         or (rule.severity == "error" and not rule.refused and not (recorded and rule.code.startswith(SPLITS)))
     ]
     folder = Path(clip.subject)
-    evidence = clip_evidence(
+    evidence = Evidence.of_clip(
         folder, as_capture(clip), LintSettings(views=VIEWS), no_progress, before_run=True
     )
     errors = []

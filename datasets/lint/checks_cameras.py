@@ -362,7 +362,7 @@ def _compared(evidence: Evidence) -> Mapping[str, CameraFacts]:
     return facts
 
 
-def _astray(evidence: Evidence) -> dict[str, tuple[float, float]]:
+def _misaligned(evidence: Evidence) -> dict[str, tuple[float, float]]:
     """Cameras that show the face at another offset than the others, or not at its projection: distance of their offset
     from the others' in pixels, and its limit."""
     facts = _compared(evidence)
@@ -384,7 +384,7 @@ def exchanged_cameras(evidence: Evidence) -> dict[str, str]:
     facts = _compared(evidence)
     return {
         c: facts[c].fits
-        for c in _astray(evidence)
+        for c in _misaligned(evidence)
         if facts[c].fits and facts[c].fits_match > facts[c].match + BETTER
     }
 
@@ -398,20 +398,22 @@ def _spread(values: Mapping[str, float], least: float) -> tuple[float, float]:
 
 def blurred_cameras(evidence: Evidence) -> dict[str, float]:
     """The limit below which sharpness is reported, by camera."""
-    taken = exchanged_cameras(evidence)
+    explained = exchanged_cameras(evidence)
     values = {c: f.sharpness for c, f in _compared(evidence).items() if np.isfinite(f.sharpness)}
     if len(values) < FEWEST_CAMERAS:
         return {}
     middle, distance = _spread(values, LEAST_SOFT)
     return {
-        c: middle - distance for c, value in values.items() if value < middle - distance and c not in taken
+        c: middle - distance
+        for c, value in values.items()
+        if value < middle - distance and c not in explained
     }
 
 
 def late_cameras(evidence: Evidence) -> dict[str, float]:
     """The exceeded limit of the offset's change over time in pixels, by camera."""
     facts = _compared(evidence)
-    taken = {*exchanged_cameras(evidence), *blurred_cameras(evidence)}
+    explained = {*exchanged_cameras(evidence), *blurred_cameras(evidence)}
     values = {c: f.unsteady for c, f in facts.items()}
     if not values:
         return {}
@@ -425,14 +427,14 @@ def late_cameras(evidence: Evidence) -> dict[str, float]:
         and f.match > TELLING_MATCH
         and f.unsteady > middle + distance
         and f.unsteady_at_lag < SYNCHRONOUS * f.unsteady
-        and c not in taken
+        and c not in explained
     }
 
 
 def shifted_cameras(evidence: Evidence) -> dict[str, tuple[float, float]]:
     """Displaced cameras without another fault: distance of their offset from the others' in pixels, and its limit."""
-    taken = {*exchanged_cameras(evidence), *blurred_cameras(evidence), *late_cameras(evidence)}
-    return {c: distance for c, distance in _astray(evidence).items() if c not in taken}
+    explained = {*exchanged_cameras(evidence), *blurred_cameras(evidence), *late_cameras(evidence)}
+    return {c: distance for c, distance in _misaligned(evidence).items() if c not in explained}
 
 
 def _offset_distances(facts: Mapping[str, CameraFacts]) -> dict[str, float]:

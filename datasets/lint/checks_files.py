@@ -12,9 +12,10 @@ from ...bench.io.files import entries
 from ...bench.progress import counted
 from ..ga import layout
 from ..ga.transforms import FrameEntry
+from .capture import Slot
 from .checks_cameras import dead_cameras
 from .checks_images import unit_range
-from .evidence import Evidence, Slot
+from .evidence import Evidence
 from .rules import Hit, at, rule, some, spans
 from .views import Thumbnail, near_duplicates
 
@@ -227,10 +228,10 @@ def _unreasoned(evidence: Evidence) -> Iterator[Hit]:
     """
     if evidence.declaration is None:
         return
-    bare = [t for t, reason in evidence.declaration.excluded.items() if not reason.strip()]
-    if bare:
+    unreasoned = [t for t, reason in evidence.declaration.excluded.items() if not reason.strip()]
+    if unreasoned:
         file = evidence.folder / layout.DECLARATION_FILE
-        yield Hit(f"timesteps {spans(bare)} are excluded without a reason", file, "excluded")
+        yield Hit(f"timesteps {spans(unreasoned)} are excluded without a reason", file, "excluded")
 
 
 @rule("HB110", "warning")
@@ -246,11 +247,11 @@ def _short_test(evidence: Evidence) -> Iterator[Hit]:
     for entry in evidence.splits.get("self_reenactment", ()):
         timesteps[entry.sequence_folder].add(entry.timestep)
     for folder, present in timesteps.items():
-        kept = len(present - excluded)
-        if kept < least:
+        count = len(present - excluded)
+        if count < least:
             left_out = f" ({len(present & excluded)} excluded)" if present & excluded else ""
             yield Hit(
-                f"test sequence {evidence.names[folder]} has {counted(kept, 'timestep')}{left_out}, "
+                f"test sequence {evidence.names[folder]} has {counted(count, 'timestep')}{left_out}, "
                 f"fewer than {least}",
                 evidence.split_file("self_reenactment"),
             )
@@ -263,7 +264,7 @@ def _empty_split(evidence: Evidence) -> Iterator[Hit]:
 
     Hold out a camera for novel views and a sequence for self-reenactment.
     """
-    cameras = {entry.camera_id for part in evidence.splits.values() for entry in part}
+    cameras = {entry.camera_id for entry in evidence.entries}
     needed = [name for name in layout.SPLIT_FILES if name != "novel_view" or len(cameras) > 1]
     faulty = {error.file for error in evidence.faults.errors("json", "frame")}
     files = {name: evidence.split_file(name) for name in needed}
@@ -295,7 +296,7 @@ def _orphans(evidence: Evidence) -> Iterator[Hit]:
 
     Delete them, or add them to a split if they should be used.
     """
-    named = {entry.image for entry in evidence.entries}
+    named = {entry.image for entry in evidence.imaged_entries}
     folders = {entry.image.parent for entry in evidence.entries}
     # Frames that do not parse refer to unknown images.
     if evidence.faults.errors("json", "frame"):
@@ -318,11 +319,11 @@ def _uneven_masks(evidence: Evidence) -> Iterator[Hit]:
 
     Export all masks: regions and masked metrics would cover only a part of the frames.
     """
-    bare = [entry for entry in evidence.entries if entry.mask is None]
-    share = len(bare) / max(1, len(evidence.entries))
+    unmasked = [entry for entry in evidence.entries if entry.mask is None]
+    share = len(unmasked) / max(1, len(evidence.entries))
     if 0 < share < 1:
-        text = f"{counted(len(bare), 'frame')} of {len(evidence.entries)} name no mask, the others do"
-        yield Hit(text, *at(bare[0], "fg_mask_path"))
+        text = f"{counted(len(unmasked), 'frame')} of {len(evidence.entries)} name no mask, the others do"
+        yield Hit(text, *at(unmasked[0], "fg_mask_path"))
 
 
 @rule("HB115", "note")
@@ -349,11 +350,11 @@ def _same_images(evidence: Evidence) -> Iterator[Hit]:
     # By content, which includes files that are listed twice.
     dead = dead_cameras(evidence)  # all of their images are the same
     contents: dict[str, dict[str, FrameEntry]] = {}
-    for split, part in evidence.splits.items():
-        held = contents.setdefault(split, {})
-        for entry in part:
+    for split, frames in evidence.splits.items():
+        images = contents.setdefault(split, {})
+        for entry in frames:
             if entry.image in evidence.digests and entry.camera_id not in dead:
-                held.setdefault(evidence.digests[entry.image], entry)
+                images.setdefault(evidence.digests[entry.image], entry)
     for one, other in combinations(contents, 2):
         shared = sorted(contents[one].keys() & contents[other].keys())
         if shared:
@@ -430,10 +431,10 @@ def _twice(evidence: Evidence) -> Iterator[Hit]:
 
     Delete the second entry: it would be trained on or counted twice.
     """
-    for split, part in evidence.splits.items():
+    for split, frames in evidence.splits.items():
         seen: set[tuple[int, str]] = set()
         twice = []
-        for entry in part:
+        for entry in frames:
             slot = (entry.timestep, entry.camera_id)
             if slot in seen:
                 twice.append(entry)

@@ -16,9 +16,8 @@ from ..ga import layout
 from ..novelty import displacement_metric, novelty
 from .checks_cameras import faulty_cameras, misplaced
 from .evidence import Evidence
-from .mesh import MeshFacts
 from .rules import Hit, rule, some, spans
-from .views import ViewFacts
+from .views import MeshFacts, ViewFacts
 
 STILL = 1e-4
 """Radians, or coefficients: smaller changes over a capture count as none."""

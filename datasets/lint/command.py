@@ -56,16 +56,16 @@ def lint_capture(settings: LintSettings, progress: Progress = no_progress) -> tu
     from ..ga.reader import find_capture
     from ..open import find_reader
     from .catalogue import RULES
-    from .evidence import clip_evidence, read_evidence
+    from .evidence import Evidence
 
     if find_reader(settings.clip, settings.reader).name == "ga":
         if settings.set:
             expected = "no settings: of the reader ga, lint looks at the files"
             raise InputError("command line", "--set", expected, ", ".join(settings.set), "Leave it out.")
-        evidence = read_evidence(find_capture(settings.clip), settings, progress)
+        evidence = Evidence.of_files(find_capture(settings.clip), settings, progress)
     else:
         clip = settings.open(settings.clip, progress)
-        evidence = clip_evidence(Path(settings.clip), clip, settings, progress)
+        evidence = Evidence.of_clip(Path(settings.clip), clip, settings, progress)
     return evidence, apply(RULES, evidence, settings.ignore, base=evidence.folder.parent)
 
 

@@ -1,41 +1,24 @@
-"""Content of a capture and measurements of it, the input of the linter's checks.
-
-The reader of the GaussianAvatars/VHAP layout collects its errors here instead of raising the first, so that one broken
-frame does not hide other faults. Captures of other readers are taken from their clips. Measurements are made when a check
-first needs them.
-"""
+"""Measurements of a capture, the input of the linter's checks. Each is made when a check first needs it."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray, Camera, HeadPose, Progress, no_progress
+from ...bench.contracts import ByteArray, Camera, FloatArray
 from ...bench.errors import InputError
-from ...bench.io.arrays import read_npz
-from ...bench.io.files import digest
-from ...bench.io.images import ImageInfo, probe_image
-from ..clip import CaptureClip, FrameFiles
-from ..ga import layout
-from ..ga.content_digests import content_digests, digests_of_same_size
-from ..ga.reader import build_clip, read_content
-from ..ga.tracking import Tracking, TrackingReading, check_neutral, pose_to_parameters
-from ..ga.transforms import Fault, Faults, FrameEntry
-from ..ga.validate import sequence_names
-from ..head.arrays import HeadArrays
-from ..images import read_image, read_mask
+from ...bench.protocol import evenly_with_ends
+from ..ga.transforms import FrameEntry
+from ..head.geometry import project, vertex_normals
 from .camera_table import CameraFacts, measure_cameras
-from .mesh import ExpressionFit, TrackedSubject, weigh_expression
-from .views import Thumbnail, ViewFacts, inspect_views, make_thumbnails, pick_views
-
-if TYPE_CHECKING:
-    from .settings import LintSettings
+from .capture import Capture, TrackedSubject
+from .views import Thumbnail, ViewFacts, facing_camera, inspect_views, make_thumbnails, pick_views
 
 THOROUGH_TIMESTEPS = 32
 """Timesteps on which cameras are measured with ``--thorough``."""
@@ -45,177 +28,131 @@ FEW_SHOTS, FEWEST_TIMESTEPS = 48, 2
 """Before a run, most pixels of the views and most images to measure cameras on, which take a few seconds; and numbers of views
 and timesteps that are taken in any case."""
 
-OFFSETS = ("static_offset", "dynamic_offset")
-"""Arrays with a row per vertex; too large to keep for every timestep."""
+FRAMES = 16
+"""Frames to judge by."""
+
+FEWEST_FRAMES, FEWEST_VERTICES = 6, 50
+"""Minimum amount of data for a result."""
+
+FACING = 0.5
+"""Minimum cosine between a vertex's normal and the direction to the camera."""
+
+MOVES_PX = 0.5
+"""Minimum motion of a vertex's projection by expression, for vertices that are compared."""
 
 
-class Slot(NamedTuple):
-    """Position of a frame in the grid of a capture."""
+class ExpressionFit(NamedTuple):
+    """Ratio of the variances over time of the face's colours with the expression and with a face at rest.
 
-    timestep: int
-    camera_index: int
+    ``mean`` and ``median`` compare the mean and the median over ``vertices`` vertices in ``frames`` frames of
+    ``camera``: below 1 if the expression explains the images.
+    """
 
-
-@dataclass(frozen=True, eq=False)
-class Parameters:
-    """One parameter file."""
-
-    timestep: int
-    path: Path
-    arrays: Mapping[str, np.ndarray]
-    """Stored arrays without the per-vertex `OFFSETS`; empty if the file cannot be read."""
-    not_finite: tuple[str, ...] = ()
-    """Names of arrays with NaN or infinite numbers."""
-    offset_change_m: float = 0.0
-    """Largest difference of its static offset from the first file's; 0 without one."""
-    dynamic_m: float = 0.0
-    """Largest entry of its dynamic offset; 0 without one."""
-    pose: HeadPose | None = None
-    """None if the head is unknown or the arrays do not fit it."""
-    error: InputError | None = None
-    """Why there is no pose."""
-
-
-@dataclass(frozen=True)
-class Pixels:
-    """Source of the pixels of frames; both functions raise `InputError` for damaged files."""
-
-    headers: Mapping[Path, ImageInfo]
-    """Headers of the existing images and masks, by path."""
-    image: Callable[[FrameEntry], ByteArray]
-    """Function from a frame to its image (H, W, 3) on the background."""
-    mask: Callable[[FrameEntry], ByteArray | None]
-    """Function from a frame to its mask (H, W); None without a mask of the image's size."""
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """Declarations and content of a capture, and measurements of its images."""
-
-    folder: Path
-    settings: LintSettings
-    of_layout: bool
-    """Whether it is a capture of the GaussianAvatars/VHAP layout."""
-    background: tuple[float, ...]
-    """Declared colour, else white."""
-    cy: layout.CyConvention
-    """Convention of the entries' intrinsics."""
-    convention: layout.CyConvention | None
-    """The requested convention, else the declared one; None without either."""
-    splits: Mapping[str, Sequence[FrameEntry]]
-    """Frames that could be read, by split."""
-    pixels: Pixels
-    parameters: Mapping[int, Parameters]
-    """Tracked parameters by timestep."""
-    subject: TrackedSubject | None
-    """Head and identity that fit the parameters; None if no file fits."""
-    declaration: layout.Declaration | None = None
-    """Its ``headbench.json``; None if it is missing or invalid."""
-    faults: Faults = field(default_factory=Faults)
-    """Errors of the reader."""
-    before_run: bool = False
-    """Whether to measure only what the errors need that are searched for before a run: digests of image files that have
-    the same size as one of another split, fewer views and timesteps."""
-    progress: Progress = no_progress
+    camera: str
+    frames: int
+    vertices: int
+    mean: float
+    median: float
 
     @property
-    def headers(self) -> Mapping[Path, ImageInfo]:
-        """Headers of the existing images and masks, by path."""
-        return self.pixels.headers
+    def ratio(self) -> float:
+        """Geometric mean of both: the mean is dominated by the few vertices that move much, the median by the others."""
+        return math.sqrt(self.mean * self.median)
 
-    @cached_property
-    def entries(self) -> tuple[FrameEntry, ...]:
-        """Frames of all splits."""
-        return tuple(entry for entries in self.splits.values() for entry in entries)
 
-    @cached_property
-    def imaged(self) -> dict[str, list[FrameEntry]]:
-        """Frames with an existing image, by split."""
-        return {
-            split: [e for e in entries if e.image in self.headers] for split, entries in self.splits.items()
-        }
+@dataclass(frozen=True, eq=False)
+class _FaceColours:
+    """Colours that the face's vertices have in one frame."""
 
-    @cached_property
-    def unread(self) -> frozenset[Slot]:
-        """Slots of frames listed in a JSON that could not be read."""
-        return frozenset().union(*(_slot(fault.content) for fault in self.faults if fault.kind == "frame"))
+    colours: FloatArray  # (F, 3)
+    seen: np.ndarray  # (F,)
+    pixels: FloatArray  # (F, 2)
 
-    @cached_property
-    def file_faults(self) -> list[InputError]:
-        """Errors of missing and damaged images and masks."""
-        paths = {path for entry in self.entries for path in (entry.image, entry.mask) if path is not None}
-        errors = []
-        for path in sorted(paths - self.headers.keys()):
-            try:
-                probe_image(path)
-            except InputError as error:
-                errors.append(error)
-            except ValueError as error:  # an impossible file name
-                errors.append(InputError(path, "", "an image file", str(error)))
-        return errors
 
-    def split_file(self, split: str) -> Path:
-        """The file that defines a split; the capture for layouts of other readers."""
-        return self.folder / layout.SPLIT_FILES[split] if self.of_layout else self.folder
+def weigh_expression(capture: Capture, camera: str | None) -> ExpressionFit | None:
+    """Compare the expression with a face at rest in the images of a camera; None if there are too few data."""
+    subject = capture.subject
+    if subject is None or camera is None:
+        return None
+    poses = {entry: capture.pose(entry.timestep) for entry in capture.imaged_entries}
+    usable = sorted(
+        (entry for entry, pose in poses.items() if entry.camera_id == camera and pose is not None),
+        key=lambda entry: entry.timestep,
+    )
+    moving: list[_FaceColours] = []
+    resting: list[_FaceColours] = []
+    for entry in evenly_with_ends(usable, FRAMES):
+        pose = poses[entry]
+        if pose is None:
+            continue
+        try:
+            image = capture.pixels.image(entry)
+        except InputError:
+            continue  # reported as a damaged file
+        still = replace(pose, expression=np.zeros_like(pose.expression))
+        for samples, vertices in zip((moving, resting), subject.meshes([pose, still])):
+            samples.append(_face_colours(vertices, subject, capture.camera(entry), image))
+    return _compare(camera, moving, resting)
 
-    @cached_property
-    def names(self) -> Mapping[str, str]:
-        """Sequence name by sequence folder."""
-        if not self.of_layout:
-            return {entry.sequence_folder: entry.sequence_folder for entry in self.entries}
-        return sequence_names(self.entries, self.declaration.sequences if self.declaration else {})
 
-    @cached_property
-    def sequences(self) -> Mapping[str, tuple[int, ...]]:
-        """Timesteps by sequence folder, sorted."""
-        timesteps: dict[str, set[int]] = defaultdict(set)
-        for entry in self.entries:
-            timesteps[entry.sequence_folder].add(entry.timestep)
-        return {folder: tuple(sorted(numbers)) for folder, numbers in timesteps.items()}
+def _face_colours(
+    vertices: FloatArray, subject: TrackedSubject, camera: Camera, image: ByteArray
+) -> _FaceColours:
+    points = vertices[subject.skin]
+    outward = vertex_normals(vertices, subject.head.faces)[subject.skin]
+    towards = camera.center - points
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    pixels = project(points, camera)
+    where = (pixels - 0.5).astype(np.float32)  # OpenCV's pixel centres are at integers
+    sampled = cv2.remap(image.astype(np.float32), where[:, :1], where[:, 1:], cv2.INTER_LINEAR)
+    colours = sampled[:, 0].astype(np.float64)
+    within = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    return _FaceColours(colours, ((outward * towards).sum(axis=1) > FACING) & within, pixels)
 
-    @cached_property
-    def posed(self) -> Sequence[Parameters]:
-        """Parameters with a pose."""
-        return [parameters for parameters in self.parameters.values() if parameters.pose is not None]
 
-    def pose(self, timestep: int) -> HeadPose | None:
-        """Pose of a timestep; None if it has none."""
-        return self.parameters[timestep].pose if timestep in self.parameters else None
+def _compare(
+    camera: str, moving: Sequence[_FaceColours], resting: Sequence[_FaceColours]
+) -> ExpressionFit | None:
+    if len(moving) < FEWEST_FRAMES:
+        return None
+    # Only vertices visible in both are compared.
+    seen = np.array([one.seen & other.seen for one, other in zip(moving, resting)])
+    moved = np.array(
+        [np.linalg.norm(one.pixels - other.pixels, axis=1) for one, other in zip(moving, resting)]
+    )
+    telling = (seen.sum(axis=0) >= FEWEST_FRAMES) & (moved.max(axis=0) >= MOVES_PX)
+    if telling.sum() < FEWEST_VERTICES:
+        return None
+    ours = _variance(moving, seen)[telling]
+    rest = _variance(resting, seen)[telling]
+    if rest.mean() <= 0 or np.median(rest) <= 0:
+        return None  # a face of one colour
+    return ExpressionFit(
+        camera,
+        len(moving),
+        int(telling.sum()),
+        float(ours.mean() / rest.mean()),
+        float(np.median(ours) / np.median(rest)),
+    )
 
-    def camera(self, entry: FrameEntry) -> Camera:
-        """Camera of a frame from its entry, in the world of its sequence."""
-        info = self.headers[entry.image]
-        intrinsics = layout.intrinsics_from_json(entry.intrinsics, info.width, info.height, self.cy)
-        extrinsics = layout.extrinsics_from_json(entry.camera_to_world)
-        return Camera(entry.camera_id, info.width, info.height, intrinsics, extrinsics)
 
-    @cached_property
-    def digests(self) -> Mapping[Path, str]:
-        """Content digest of every existing image; of its pixels where no file has the frame's pixels."""
-        if self.before_run:
-            return digests_of_same_size({name: [e.image for e in s] for name, s in self.splits.items()})
-        images = {entry.image: entry for entries in self.imaged.values() for entry in entries}
-        digests = content_digests((path for path in images if path.is_file()), progress=self.progress)
-        computed = [path for path in images if path not in digests]
-        for done, path in enumerate(computed, start=1):
-            digests[path] = digest(self.pixels.image(images[path]))
-            self.progress(done, len(computed), "reading images")
-        return digests
+def _variance(picked: Sequence[_FaceColours], seen: np.ndarray) -> FloatArray:
+    """(F,) variance of each vertex's colour over the frames in which it is visible, mean over channels."""
+    weight = seen[..., None].astype(np.float64)
+    colours = np.array([one.colours for one in picked])
+    count = np.maximum(weight.sum(axis=0), 1)
+    mean = (colours * weight).sum(axis=0) / count
+    variance: FloatArray = ((((colours - mean) ** 2) * weight).sum(axis=0) / count).mean(axis=1)
+    return variance
 
-    @cached_property
-    def contents(self) -> Mapping[int, Mapping[str, str]]:
-        """Digest of each existing image by timestep and camera id."""
-        contents: dict[int, dict[str, str]] = defaultdict(dict)
-        for entry in self.entries:
-            if entry.image in self.digests:
-                contents[entry.timestep][entry.camera_id] = self.digests[entry.image]
-        return contents
+
+class Evidence(Capture):
+    """A capture and measurements of its images."""
 
     @cached_property
     def views(self) -> Sequence[ViewFacts]:
         """Facts on decoded frames."""
-        entries = [entry for part in self.imaged.values() for entry in part]
-        count = self.settings.views
+        entries, count = self.imaged_entries, self.settings.views
         if self.before_run:
             sizes = ((entry.width or 0) * (entry.height or 0) for entry in entries)
             count = min(count, max(FEWEST_VIEWS, FEW_PIXELS // max(1, 1, *sizes)))
@@ -230,199 +167,19 @@ class Evidence:
     @cached_property
     def expression_fit(self) -> ExpressionFit | None:
         """How well expressions explain the images; None if that cannot be measured."""
-        return weigh_expression(self)
+        return weigh_expression(self, facing_camera(self.views))
 
     @cached_property
     def cameras(self) -> Mapping[str, CameraFacts]:
         """Measurements of each camera."""
         timesteps = THOROUGH_TIMESTEPS if self.settings.thorough else self.settings.camera_timesteps
         if self.before_run:
-            cameras = {entry.camera_id for entries in self.imaged.values() for entry in entries}
+            cameras = {entry.camera_id for entry in self.imaged_entries}
             timesteps = min(timesteps, max(FEWEST_TIMESTEPS, FEW_SHOTS // max(1, len(cameras))))
         return measure_cameras(self, timesteps) if timesteps else {}
 
 
-def read_evidence(folder: Path, settings: LintSettings, progress: Progress) -> Evidence:
-    """Evidence from a capture of the GaussianAvatars/VHAP layout with any errors."""
-    faults = Faults(collect=True)
-    content = read_content(folder, settings.head, faults=faults, progress=progress)
-    parameters, tracking = _read_parameters(content.parameters, content.head, faults, progress)
-    if tracking is not None and not faults:
-        with faults.of("check"):
-            build_clip(content, tracking, cy=settings.cy, leaks="record", progress=progress)
-    declaration = content.declaration
-    declared = declaration.cy if declaration else None
-    convention = settings.cy if settings.cy != "auto" else declared
-    background = declaration.background if declaration else (1.0, 1.0, 1.0)
-    return Evidence(
-        folder=folder,
-        settings=settings,
-        of_layout=True,
-        background=background,
-        cy=convention or "bottom",
-        convention=convention,
-        splits=content.splits,
-        pixels=Pixels(
-            content.infos,
-            lambda entry: read_image(entry.image, background),
-            partial(_read_mask, content.infos),
-        ),
-        parameters=parameters,
-        subject=TrackedSubject(tracking) if tracking else None,
-        declaration=declaration,
-        faults=faults,
-        progress=progress,
-    )
-
-
-def clip_evidence(
-    folder: Path, clip: CaptureClip, settings: LintSettings, progress: Progress, *, before_run: bool = False
-) -> Evidence:
-    """Evidence from a clip of any reader, without the layout's files.
-
-    With ``before_run``, what the reader of the GaussianAvatars/VHAP layout recorded is used as well.
-    """
-    steps = [step.parameters for step in clip.steps if before_run and step.name == "read_capture"]
-    requested = settings.cy if settings.cy != "auto" else None
-    convention: layout.CyConvention | None = steps[0]["cy"] if steps else requested
-    cy: layout.CyConvention = steps[0]["cy"] if steps else "top"
-    rig: dict[str, dict[str, Any]] = {
-        name: {
-            "camera_index": index,
-            "camera_id": name,
-            "width": camera.width,
-            "height": camera.height,
-            "intrinsics": layout.intrinsics_to_json(camera, cy),
-            "camera_to_world": np.array(layout.extrinsics_to_json(camera.world_to_camera)),
-        }
-        for index, (name, camera) in enumerate(clip.cameras.items())
-    }
-    entries, headers, keys = {}, {}, {}
-    for key in [key for split in clip.splits.values() for key in split]:
-        # The key stands in for a file whose pixels are not those of the frame.
-        files = clip.files[key] if before_run or not clip.pixel_steps else FrameFiles(None, None)
-        info = ImageInfo(clip.cameras[key.camera].width, clip.cameras[key.camera].height, 3)
-        image, mask = files.image or Path(str(key)), None
-        headers[image], keys[image] = info, key
-        if clip.has_mask(key):
-            mask = files.mask or Path(f"{key} mask")
-            headers[mask] = info
-        entries[key] = FrameEntry(
-            file=folder,
-            where=f"frame {key}",
-            timestep=key.timestep,
-            sequence_folder=key.sequence,
-            image=image,
-            mask=mask,
-            parameters=folder,
-            **rig[key.camera],
-        )
-    parameters = {}
-    for timestep, pose in clip.poses.items():
-        arrays = pose_to_parameters(pose)
-        parameters[timestep] = Parameters(timestep, folder, arrays, _not_finite(arrays), pose=pose)
-    return Evidence(
-        folder=folder,
-        settings=settings,
-        of_layout=bool(steps),
-        background=tuple(clip.background.tolist()),
-        cy=cy,
-        convention=convention,
-        splits={name: tuple(entries[key] for key in split) for name, split in clip.splits.items()},
-        pixels=Pixels(
-            headers, lambda entry: clip.image(keys[entry.image]), lambda entry: clip.mask(keys[entry.image])
-        ),
-        parameters=parameters,
-        subject=TrackedSubject(Tracking(clip.head, clip.poses, clip.shape, clip.static_offset)),
-        before_run=before_run,
-        progress=progress,
-    )
-
-
-def _slot(frame: Any) -> set[Slot]:
-    """Slot of a frame that does not parse; empty if it is unknown."""
-    if not isinstance(frame, dict):
-        return set()
-    timestep, camera = frame.get("timestep_index"), frame.get("camera_index", 0)
-    return {Slot(timestep, camera)} if isinstance(timestep, int) and isinstance(camera, int) else set()
-
-
-def _read_parameters(
-    files: Mapping[int, Path], head: HeadArrays | None, faults: Faults, progress: Progress
-) -> tuple[dict[int, Parameters], Tracking | None]:
-    """Parameters by timestep, and the tracking of those that fit the head model; None if none does."""
-    parameters: dict[int, Parameters] = {}
-    reading = TrackingReading(head, "") if head is not None else None
-    first_offset: np.ndarray | None = None
-    for done, (timestep, path) in enumerate(sorted(files.items()), start=1):
-        progress(done, len(files), "reading parameters")
-        try:
-            arrays = read_npz(path)
-        except InputError as error:
-            faults.append(Fault("parameters", error, None))
-            parameters[timestep] = Parameters(timestep, path, {}, error=error)
-            continue
-        offset = _numbers(arrays.get("static_offset"))
-        first_offset = offset if first_offset is None else first_offset
-        misfit = _add(reading, timestep, path, arrays, faults) if reading else None
-        parameters[timestep] = Parameters(
-            timestep=timestep,
-            path=path,
-            arrays={name: array for name, array in arrays.items() if name not in OFFSETS},
-            not_finite=_not_finite(arrays),
-            offset_change_m=_largest(offset - first_offset) if offset.shape == first_offset.shape else 0.0,
-            dynamic_m=_largest(_numbers(arrays.get("dynamic_offset"))),
-            pose=reading.poses[timestep] if reading and misfit is None else None,
-            error=misfit,
-        )
-    return parameters, reading.tracking() if reading and reading.poses else None
-
-
-def _add(
-    reading: TrackingReading, timestep: int, path: Path, arrays: Mapping[str, np.ndarray], faults: Faults
-) -> InputError | None:
-    """Add arrays to the tracking; the error if they do not fit, also of an identity that the reader does not use."""
-    try:
-        shape, static_offset = reading.add(timestep, path, arrays)
-    except InputError as error:
-        faults.append(Fault("parameters", error, None))
-        return None if timestep in reading.poses else error
-    try:
-        check_neutral(path, reading.head, shape, static_offset)
-    except InputError as error:
-        return error
-    return None
-
-
-def _not_finite(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
-    """Names of the arrays with NaN or infinite numbers."""
-    return tuple(name for name, array in arrays.items() if not _is_finite(array))
-
-
-def _numbers(array: np.ndarray | None) -> np.ndarray:
-    """The array if its numbers are finite, else an empty one."""
-    usable = array is not None and array.dtype.kind in "fiu" and _is_finite(array)
-    return array if array is not None and usable else np.empty(0)
-
-
-def _is_finite(array: np.ndarray) -> bool:
-    return array.dtype.kind not in "f" or bool(np.isfinite(array).all())
-
-
-def _largest(array: np.ndarray) -> float:
-    return float(np.abs(array).max(initial=0.0))
-
-
-def _read_mask(headers: Mapping[Path, ImageInfo], entry: FrameEntry) -> ByteArray | None:
-    info = headers[entry.image]
-    path = entry.mask if entry.mask is not None else (entry.image if info.has_alpha else None)
-    header = headers.get(path) if path is not None else None
-    if path is None or header is None or (header.width, header.height) != (info.width, info.height):
-        return None
-    return read_mask(path, own=path == entry.image)
-
-
-def by_camera(entries: Iterable[FrameEntry]) -> dict[str, list[FrameEntry]]:
+def by_camera(entries: Sequence[FrameEntry]) -> dict[str, list[FrameEntry]]:
     """Frames by camera id, cameras in index order."""
     frames: dict[str, list[FrameEntry]] = {}
     for entry in sorted(entries, key=lambda e: (e.camera_index, e.timestep)):
