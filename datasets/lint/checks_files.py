@@ -296,7 +296,7 @@ def _orphans(evidence: Evidence) -> Iterator[Hit]:
 
     Delete them, or add them to a split if they should be used.
     """
-    named = {entry.image for entry in evidence.imaged_entries}
+    named = {entry.image for entry in evidence.entries if os.path.exists(entry.image)}
     folders = {entry.image.parent for entry in evidence.entries}
     # Frames that do not parse refer to unknown images.
     if evidence.faults.errors("json", "frame"):
