@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata
 from importlib.metadata import Distribution, EntryPoint
+from pathlib import Path
 from typing import Any, Literal
 
 from .errors import HeadbenchError, InputError
@@ -100,6 +101,23 @@ def resolve(reference: str) -> Any:
         where = " It is looked for on PYTHONPATH." if isinstance(error, ModuleNotFoundError) else ""
         raise HeadbenchError(f"{reference}: cannot be imported: {error}.{where}") from error
     return value
+
+
+def readers() -> dict[str, DatasetSpec]:
+    """The readers that are installed, by name."""
+    specs = {name: plugin.spec for name, plugin in discover("datasets").items()}
+    return {name: spec for name, spec in specs.items() if spec is not None and spec.reads}
+
+
+def finds(spec: DatasetSpec, root: Path) -> bool:
+    """Whether a reader finds captures; one that cannot be imported or fails finds none."""
+    try:
+        return bool(spec.find and resolve(spec.find)(root))
+    except HeadbenchError:
+        return False
+    except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way; the others must still be asked
+        log.warning("reader %s cannot check %s: %s: %s", spec.name, root, type(error).__name__, error)
+        return False
 
 
 def unknown(file: str, key: str, name: str, known: Any, remedy: str = "") -> InputError:

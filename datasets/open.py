@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ..bench.contracts import Progress, no_progress
-from ..bench.engine.captures import finds, found_captures, readers
 from ..bench.errors import InputError
-from ..bench.registry import get, resolve
+from ..bench.registry import finds, get, readers, resolve
 from ..bench.specs import DatasetSpec
 from .clip import CaptureClip, as_capture
 from .foreign import describe
@@ -56,6 +55,8 @@ def open_clips(
     settings : Mapping[str, Any] | None
         Settings of the reader.
     """
+    from ..bench.engine.captures import found_captures  # slow to import
+
     spec = find_reader(path, reader)
     known = inspect.signature(resolve(spec.implementation)).parameters
     given = {key: value for key, value in (wishes or {}).items() if key in known}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -13,16 +12,15 @@ from typing import Any, Literal, get_args, get_type_hints
 from ..condition import Named
 from ..configuration import build_arguments
 from ..contracts import Clip, Progress
-from ..errors import HeadbenchError, InputError
+from ..errors import InputError
 from ..io.files import check_name
 from ..progress import progress
-from ..registry import discover, get, resolve
+from ..registry import finds, get, readers, resolve
 from ..specs import LABEL, DatasetSpec, ResolutionRule, is_label
 from .adaptation import MethodNeeds, apply, plan
 from .config import RunConfig, RunOptions, resolve_change
 from .store import RunFolder
 
-log = logging.getLogger(__name__)
 Plugins = Literal["methods", "metrics"]
 HARNESS = ("progress", "use_cache")
 """Keywords of a reader that are set by the harness, not by settings, see `DatasetSpec`."""
@@ -77,23 +75,6 @@ def found_captures(
         return one
 
     return [(Path(path), reads(path)) for path in paths]
-
-
-def readers() -> dict[str, DatasetSpec]:
-    """The readers that are installed, by name."""
-    found = {name: plugin.spec for name, plugin in discover("datasets").items()}
-    return {name: spec for name, spec in found.items() if spec is not None and spec.reads}
-
-
-def finds(spec: DatasetSpec, root: Path) -> bool:
-    """Whether a reader finds captures; one that cannot be imported or fails finds none."""
-    try:
-        return bool(spec.find and resolve(spec.find)(root))
-    except HeadbenchError:
-        return False
-    except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way; the others must still be asked
-        log.warning("reader %s cannot check %s: %s: %s", spec.name, root, type(error).__name__, error)
-        return False
 
 
 def reader_of(root: str) -> str:

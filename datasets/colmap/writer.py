@@ -18,7 +18,8 @@ from ...bench.errors import InputError
 from ...bench.io.files import atomic_path
 from ..clip import CaptureClip
 from ..ga import layout
-from ..ga.writer import identity_parameters, pose_to_parameters, save_npz
+from ..ga.tracking import pose_to_parameters
+from ..ga.writer import identity_parameters, save_npz
 from ..head.arrays import save_head
 from ..head.subject import PosedSubject
 from ..images import write_image

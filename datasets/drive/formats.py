@@ -23,10 +23,9 @@ from pathlib import Path
 import numpy as np
 
 from ...bench.contracts import FloatArray
-from ...bench.engine.captures import finds, readers
 from ...bench.errors import InputError
 from ...bench.io.documents import checked, read_yaml
-from ...bench.registry import unknown
+from ...bench.registry import finds, readers, unknown
 from ..ga.layout import Declaration
 from ..ga.tracking import POSE_SIZES, find_head, read_animation, read_tracking
 from ..head.arrays import HeadArrays

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -29,8 +29,8 @@ from . import layout
 from .cameras import CaptureCameras, collect_cameras
 from .content_digests import digests_below
 from .principal_point import settle_cy
-from .tracking import TeethPolicy, Tracking, find_head, read_tracking
-from .transforms import FrameEntry, read_transforms
+from .tracking import TeethPolicy, Tracking, check_version, read_head_model, read_tracking
+from .transforms import RAISED, Faults, FrameEntry, read_transforms
 from .validate import (
     LeakPolicy,
     check_disjoint,
@@ -107,46 +107,143 @@ def read_capture(
         Whether to reuse cached digests of files that have not changed since. ``headbench verify``
         sets it to False.
     """
-    folder = find_capture(path)
-    declaration = layout.Declaration.read(folder)
-    entries = _read_splits(folder, bool(held_out_sequences or held_out_cameras))
-    everything = [entry for part in entries.values() for entry in part]
-    check_timesteps(folder, everything)
-    infos = check_images(everything, decode=decode, progress=progress)
-    rig = collect_cameras(everything, infos)
-    ground, wanted = _backgrounds(folder, declaration, background, everything, infos)
-    asset = find_head(folder, declaration, head, masks=masks, regions=regions, eyelids=eyelids)
-    sequence_subject, _ = layout.parse_sequence_folder(everything[0].sequence_folder)
-    named = layout.parse_union_folder(folder.name) or sequence_subject or folder.name
-    subject = check_name(subject or (declaration.subject if declaration else named), folder, "subject")
-    files = {entry.timestep: entry.parameters for entry in everything}
-    tracking = read_tracking(files, asset, subject, teeth=teeth)
-    poses = _shift_poses(tracking, rig, everything)
-    declared = declaration.cy if declaration else None
-    convention, basis = settle_cy(folder, cy, declared, rig, tracking, poses, everything, ground)
+    content = read_content(
+        find_capture(path),
+        *(head, subject, {"masks": masks, "regions": regions, "eyelids": eyelids}),
+        resplit=bool(held_out_sequences or held_out_cameras),
+        decode=decode,
+        progress=progress,
+    )
+    assert content.head is not None, "errors are raised"
+    tracking = read_tracking(content.parameter_files, content.head, content.subject, teeth=teeth)
+    clip = build_clip(
+        content,
+        tracking,
+        cy=cy,
+        background=background,
+        below_neck=below_neck,
+        held_out_sequences=held_out_sequences,
+        held_out_cameras=held_out_cameras,
+        leaks=leaks,
+        cache_mb=cache_mb,
+        use_cache=use_cache,
+        progress=progress,
+    )
+    return exclude_given(clip, exclude)
 
-    names = sequence_names(everything, declaration.sequences if declaration else {})
-    splits, frames = _index_frames(folder, subject, names, entries, infos)
+
+@dataclass(frozen=True, eq=False)
+class CaptureContent:
+    """Content of a capture's files except parameters and pixels."""
+
+    folder: Path
+    declaration: layout.Declaration | None
+    splits: Mapping[str, Sequence[FrameEntry]]
+    infos: Mapping[Path, ImageInfo]
+    """Headers of images and masks."""
+    rig: CaptureCameras | None
+    """None if there is an error in its frames."""
+    head: HeadArrays | None
+    """None if there is an error in its file."""
+    subject: str
+
+    @property
+    def entries(self) -> list[FrameEntry]:
+        """Frames of all splits."""
+        return [entry for frames in self.splits.values() for entry in frames]
+
+    @property
+    def parameter_files(self) -> dict[int, Path]:
+        """Parameter file of each timestep, of its first frame."""
+        return {entry.timestep: entry.parameters for entry in reversed(self.entries)}
+
+
+def read_content(
+    folder: Path,
+    head: HeadArrays | str | Path | None = None,
+    subject: str = "",
+    files: Mapping[str, str | Path | None] | None = None,
+    *,
+    resplit: bool = False,
+    decode: bool = False,
+    faults: Faults = RAISED,
+    progress: Progress = no_progress,
+) -> CaptureContent:
+    """Read and check the files of a capture, without parameters; arguments as of `read_capture`.
+
+    If ``faults`` collects them, the first one is the error that `read_capture` raises, and the rest is read as far as
+    possible.
+
+    Parameters
+    ----------
+    resplit : bool
+        Whether splits are not those of the JSONs.
+    """
+    declaration, asset, rig = None, None, None
+    with faults.of("declaration"):
+        declaration = layout.Declaration.read(folder)
+    splits = _read_splits(folder, resplit, faults)
+    entries = [entry for frames in splits.values() for entry in frames]
+    with faults.of("check"):
+        check_timesteps(folder, entries)
+    infos = check_images(entries, decode=decode, faults=faults, progress=progress)
+    with faults.of("check"):
+        rig = collect_cameras([entry for entry in entries if entry.image in infos], infos)
+    with faults.of("head"):
+        asset = read_head_model(folder, declaration, head, **files or {})
+        check_version(folder, declaration, asset)
+    if entries:
+        sequence_subject, _ = layout.parse_sequence_folder(entries[0].sequence_folder)
+        named = layout.parse_union_folder(folder.name) or sequence_subject or folder.name
+        with faults.of("check"):
+            subject = check_name(
+                subject or (declaration.subject if declaration else named), folder, "subject"
+            )
+    return CaptureContent(folder, declaration, splits, infos, rig, asset, subject)
+
+
+def build_clip(
+    content: CaptureContent,
+    tracking: Tracking,
+    *,
+    cy: layout.CyConvention | Literal["auto"] = "auto",
+    background: Sequence[float] | None = None,
+    below_neck: bool = True,
+    held_out_sequences: Sequence[str] = (),
+    held_out_cameras: Sequence[str] = (),
+    leaks: LeakPolicy = "error",
+    cache_mb: float = 512.0,
+    use_cache: bool = True,
+    progress: Progress = no_progress,
+) -> CaptureClip:
+    """Clip of content without errors; arguments as of `read_capture`, which it raises the remaining errors of."""
+    folder, declaration, entries, infos = content.folder, content.declaration, content.entries, content.infos
+    rig, subject = content.rig, content.subject
+    assert rig is not None, "there are no errors"
+    ground, wanted = _backgrounds(folder, declaration, background, entries, infos)
+    poses = _shift_poses(tracking, rig, entries)
+    declared = declaration.cy if declaration else None
+    convention, basis = settle_cy(folder, cy, declared, rig, tracking, poses, entries, ground)
+
+    names = sequence_names(entries, declaration.sequences if declaration else {})
+    splits, frames = _index_frames(folder, subject, names, content.splits, infos)
     if held_out_sequences or held_out_cameras:
         splits = split_by_holding_out(folder, frames, held_out_sequences, held_out_cameras)
     # All files of the clip except the head model, which may be elsewhere and has its own digest.
-    used = {file for e in everything for file in (e.file, e.image, e.mask, e.parameters) if file is not None}
-    images = {
-        FrameKey(subject, names[e.sequence_folder], e.timestep, e.camera_id): e.image for e in everything
-    }
+    used = {file for e in entries for file in (e.file, e.image, e.mask, e.parameters) if file is not None}
+    images = {FrameKey(subject, names[e.sequence_folder], e.timestep, e.camera_id): e.image for e in entries}
     contents = digests_below(folder, used, use_cache=use_cache, progress=progress)
     if declaration:
-        ordered = sorted(everything, key=lambda e: e.timestep)
+        ordered = sorted(entries, key=lambda e: e.timestep)
         folders = dict.fromkeys(e.sequence_folder for e in ordered)
         contents[layout.DECLARATION_FILE] = declaration.digest(folders)
-    found = find_leaks(splits, images, progress=progress)
     record = {
         "cy": convention,
         "cy_from": basis,
         "sequence_shifts_m": {names[k]: v.tolist() for k, v in rig.shifts.items() if v.any()},
         "held_out_sequences": list(held_out_sequences),
         "held_out_cameras": list(held_out_cameras),
-        "leaks": check_leaks(folder, found, leaks),
+        "leaks": check_leaks(folder, find_leaks(splits, images, progress=progress), leaks),
         "synthetic": dict(declaration.synthetic) if declaration else {},
         **({"cut": declaration.cut} if declaration and declaration.cut else {}),
         **tracking.notes,
@@ -173,7 +270,7 @@ def read_capture(
         clip = mask_below_neck(clip)
     if declaration and declaration.excluded:
         clip = exclude_timesteps(clip, declaration.excluded, source=folder / layout.DECLARATION_FILE)
-    return exclude_given(clip, exclude)
+    return clip
 
 
 def find_captures(root: Path) -> list[Path]:
@@ -230,19 +327,21 @@ def pose_files(path: str | Path) -> dict[int, Path]:
     return {entry.timestep: entry.parameters for entry in entries}
 
 
-def _read_splits(folder: Path, resplit: bool) -> dict[str, list[FrameEntry]]:
+def _read_splits(folder: Path, resplit: bool, faults: Faults) -> dict[str, list[FrameEntry]]:
     """Entries by split name; with ``resplit``, ``transforms.json`` may replace the three files."""
     paths = {name: folder / file for name, file in layout.SPLIT_FILES.items()}
     if not any(path.exists() for path in paths.values()):
-        entries = {"train": read_transforms(folder / layout.ALL_FRAMES_FILE)}
-        if resplit:
-            return entries
-        remedy = "Splits are made by reader_settings.held_out_sequences and .held_out_cameras."
-        expected = "a file for each split"
-        raise InputError(paths["train"], "", expected, f"{layout.ALL_FRAMES_FILE} alone", remedy)
-    entries = {name: read_transforms(path) for name, path in paths.items()}
-    if not entries["train"]:
-        raise InputError(paths["train"], "frames", "at least one training frame", "an empty list")
+        entries = {"train": read_transforms(folder / layout.ALL_FRAMES_FILE, faults)}
+        with faults.of("check"):
+            if not resplit:
+                remedy = "Splits are made by reader_settings.held_out_sequences and .held_out_cameras."
+                expected = "a file for each split"
+                raise InputError(paths["train"], "", expected, f"{layout.ALL_FRAMES_FILE} alone", remedy)
+        return entries
+    entries = {name: read_transforms(path, faults) for name, path in paths.items()}
+    with faults.of("check"):
+        if not entries["train"]:
+            raise InputError(paths["train"], "frames", "at least one training frame", "an empty list")
     return entries
 
 
@@ -250,7 +349,7 @@ def _backgrounds(
     folder: Path,
     declaration: layout.Declaration | None,
     wanted: Sequence[float] | None,
-    entries: Iterable[FrameEntry],
+    entries: Sequence[FrameEntry],
     infos: Mapping[Path, ImageInfo],
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Background of the stored images and of the clip; they differ if images are already composited."""
@@ -258,7 +357,7 @@ def _backgrounds(
     if wanted is None:
         return declared, declared
     colour = tuple(check_colour(wanted).tolist())
-    if colour == declared or all(info.has_alpha for info in infos.values()):
+    if colour == declared or all(infos[entry.image].has_alpha for entry in entries):
         return colour, colour
     bare = [entry.image for entry in entries if entry.mask is None and not infos[entry.image].has_alpha]
     if bare:

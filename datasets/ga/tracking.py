@@ -34,7 +34,7 @@ def find_head(
     head: HeadArrays | str | Path | None,
     **files: str | Path | None,
 ) -> HeadArrays:
-    """Head model of a capture.
+    """Head model of a capture, of the declared version.
 
     Parameters
     ----------
@@ -45,23 +45,38 @@ def find_head(
         Arguments masks, regions and eyelids of `load_head`, which finds them by itself beside a FLAME
         pickle.
     """
+    asset = read_head_model(folder, declaration, head, **files)
+    check_version(folder, declaration, asset)
+    return asset
+
+
+def read_head_model(
+    folder: Path,
+    declaration: Declaration | None,
+    head: HeadArrays | str | Path | None,
+    **files: str | Path | None,
+) -> HeadArrays:
+    """Head model of a capture, of any version; arguments as of `find_head`."""
     if isinstance(head, HeadArrays):
-        asset = head
-    else:
-        path = Path(head) if head else folder / (declaration.head_file if declaration else HEAD_FILE)
-        asset = _load(path, files)
-        if asset.version == OPEN and not declaration:
-            log.warning(
-                "%s is FLAME 2023 Open. Its coefficients are not those of FLAME 2023, and %s does not say which of them "
-                "it was tracked with: `headbench prepare refit` converts a capture of FLAME 2023.",
-                path,
-                folder,
-            )
-    if declaration and asset.version != declaration.head_model:
-        expected = f"{asset.version}, the version of the head model given"
+        return head
+    path = Path(head) if head else folder / (declaration.head_file if declaration else HEAD_FILE)
+    asset = _load(path, files)
+    if asset.version == OPEN and not declaration:
+        log.warning(
+            "%s is FLAME 2023 Open. Its coefficients are not those of FLAME 2023, and %s does not say which of them "
+            "it was tracked with: `headbench prepare refit` converts a capture of FLAME 2023.",
+            path,
+            folder,
+        )
+    return asset
+
+
+def check_version(folder: Path, declaration: Declaration | None, head: HeadArrays) -> None:
+    """Check that a head model has the declared version."""
+    if declaration and head.version != declaration.head_model:
+        expected = f"{head.version}, the version of the head model given"
         remedy = "Coefficients of different head models are not interchangeable."
         raise InputError(folder / DECLARATION_FILE, "head_model", expected, declaration.head_model, remedy)
-    return asset
 
 
 def _load(path: Path, files: Mapping[str, Any]) -> HeadArrays:
@@ -78,6 +93,21 @@ TeethPolicy = Literal["auto", "add", "keep"]
 
 POSE_SIZES = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
 """Arrays of a parameter file and their numbers per timestep, in the order of VHAP's export."""
+
+
+def pose_to_parameters(pose: HeadPose) -> dict[str, FloatArray]:
+    """Per-timestep part of a ``flame_param`` file, float32; the additional ``eyelids`` only if the pose has them."""
+    parameters = {
+        "translation": pose.translation,
+        "rotation": pose.rotation,
+        "neck_pose": pose.neck,
+        "jaw_pose": pose.jaw,
+        "eyes_pose": pose.eyes,
+        "expr": pose.expression,
+    }
+    if pose.eyelids is not None:
+        parameters["eyelids"] = pose.eyelids
+    return {key: np.asarray(value, dtype=np.float32)[None] for key, value in parameters.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,39 +141,66 @@ def read_tracking(
         it is FLAME's or the static offset has rows for them. "add" always appends them; "keep" does
         not change the head.
     """
-    poses: dict[int, HeadPose] = {}
-    shape = static = None
-    closed = 0.0
-    deviation = {"shape": 0.0, "static_offset_m": 0.0, "dynamic_offset_m": 0.0}
+    reading = TrackingReading(head, subject, teeth)
     for timestep, path in sorted(files.items()):
-        arrays = read_npz(path)
-        identity = _vector(path, arrays, "shape", head.shape_basis.shape[2])
+        reading.add(timestep, path, read_npz(path))
+    return reading.tracking()
+
+
+class TrackingReading:
+    """Parameters of timesteps that are added one after the other; see `read_tracking`.
+
+    Identity, teeth and static offset are those of the first file that is accepted.
+    """
+
+    def __init__(self, head: HeadArrays, subject: str, teeth: TeethPolicy = "auto") -> None:
+        self.head, self._subject, self._teeth = head, subject, teeth
+        self.poses: dict[int, HeadPose] = {}
+        self._files: list[Path] = []
+        self._closed = 0.0
+        self._change = {"shape": 0.0, "static_offset_m": 0.0, "dynamic_offset_m": 0.0}
+
+    def add(
+        self, timestep: int, path: Path, arrays: Mapping[str, np.ndarray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Check the arrays of a file and add its pose; returns its shape, (S,), and static offset, (V, 3).
+
+        Arrays with an error are not added, except that the pose is if only the static offset has other rows than the
+        first file's.
+        """
+        shape = _vector(path, arrays, "shape", self.head.shape_basis.shape[2])
         offset = _offset(path, arrays, "static_offset")
-        if shape is None:
-            shape, static = identity, offset
-            head, rows = resolve_teeth(head, len(offset) if offset is not None else None, teeth, path)
-        deviation["shape"] = max(deviation["shape"], _largest(identity - shape))
-        deviation["static_offset_m"] = max(deviation["static_offset_m"], _offset_change(path, offset, static))
-        dynamic = _offset(path, arrays, "dynamic_offset")
-        deviation["dynamic_offset_m"] = max(deviation["dynamic_offset_m"], _largest(dynamic))
-        if "eyelids" in arrays:
-            closed = max(closed, _largest(_array(path, arrays, "eyelids")))
-        poses[timestep] = _pose(path, arrays, head, subject, timestep)
-    assert shape is not None, "callers have checked that there are timesteps"
-    static_offset = np.zeros((len(head.template), 3), dtype=np.float32)
-    if static is not None:
-        static_offset[:rows] = static[:rows]
-    check_neutral(files[min(files)], head, shape, static_offset)
-    notes = {
-        "static_offset": "zeros, as the files have none" if static is None else f"{len(static)} rows",
-        "teeth": len(head.regions.get("teeth", ())),
-        "change_of_shape_ignored": deviation["shape"],
-        "change_of_static_offset_ignored_m": deviation["static_offset_m"],
-        "dynamic_offset_ignored_m": deviation["dynamic_offset_m"],
-    }
-    return Tracking(
-        head, poses, shape, static_offset, notes | _eyelids(min(files.values()).parent, head, closed)
-    )
+        teeth: TeethPolicy = "keep" if self.poses else self._teeth
+        head, rows = resolve_teeth(self.head, len(offset) if offset is not None else None, teeth, path)
+        static_offset = np.zeros((len(head.template), 3), dtype=np.float32)
+        if offset is not None:
+            static_offset[:rows] = offset[:rows]
+        dynamic = _largest(_offset(path, arrays, "dynamic_offset"))
+        closed = _largest(_array(path, arrays, "eyelids")) if "eyelids" in arrays else 0.0
+        pose = _pose(path, arrays, head, self._subject, timestep)
+        if not self.poses:
+            check_neutral(path, head, shape, static_offset)
+            self.head, self.shape, self.static_offset, self._offset = head, shape, static_offset, offset
+        self.poses[timestep] = pose
+        self._files.append(path)
+        self._closed = max(self._closed, closed)
+        static = _offset_change(path, offset, self._offset)
+        for key, change in zip(self._change, (_largest(shape - self.shape), static, dynamic)):
+            self._change[key] = max(self._change[key], change)
+        return shape, static_offset
+
+    def tracking(self) -> Tracking:
+        """All poses and their identity."""
+        rows = f"{len(self._offset)} rows" if self._offset is not None else "zeros, as the files have none"
+        notes = {
+            "static_offset": rows,
+            "teeth": len(self.head.regions.get("teeth", ())),
+            "change_of_shape_ignored": self._change["shape"],
+            "change_of_static_offset_ignored_m": self._change["static_offset_m"],
+            "dynamic_offset_ignored_m": self._change["dynamic_offset_m"],
+        }
+        notes |= _eyelids(min(self._files).parent, self.head, self._closed)
+        return Tracking(self.head, self.poses, self.shape, self.static_offset, notes)
 
 
 def read_animation(

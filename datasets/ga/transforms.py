@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -55,18 +55,61 @@ class FrameEntry:
     camera_to_world: FloatArray  # (4, 4), OpenGL axes
 
 
-def read_transforms(path: Path) -> list[FrameEntry]:
+FaultKind = Literal["declaration", "json", "frame", "file", "head", "parameters", "check"]
+"""The content that could not be read, or "check" of content that was read."""
+
+
+class Fault(NamedTuple):
+    """An error of reading a capture."""
+
+    kind: FaultKind
+    error: InputError
+    content: Any
+    """Of a frame, its JSON object; otherwise None."""
+
+
+class Faults(list[Fault]):
+    """Errors of reading a capture: the first is raised, or with ``collect`` all are kept and reading continues."""
+
+    def __init__(self, collect: bool = False) -> None:
+        self._collect = collect
+
+    @contextmanager
+    def of(self, kind: FaultKind, content: Any = None) -> Iterator[None]:
+        """Raise or keep an `InputError` of the block."""
+        try:
+            yield
+        except InputError as error:
+            if not self._collect:
+                raise
+            self.append(Fault(kind, error, content))
+
+    def errors(self, *kinds: FaultKind) -> list[InputError]:
+        """Errors of these kinds, in the order of reading."""
+        return [fault.error for fault in self if fault.kind in kinds]
+
+
+RAISED = Faults()
+"""Raises the first error."""
+
+
+def read_transforms(path: Path, faults: Faults = RAISED) -> list[FrameEntry]:
     """Read and check the frames of a transforms JSON.
 
-    Raises `InputError` for invalid JSON, missing keys, values of the wrong type or range, and matrices that are not
-    rigid motions.
+    Faults are invalid JSON, missing keys, values of the wrong type or range, and matrices that are not rigid motions.
     """
-    document = read_json(path)
-    frames = document.get("frames")
-    if not isinstance(frames, list):
-        raise InputError(path, "frames", "a list of frames", found_entry(frames))
-    check_lenses(path, document)
-    return [parse_frame(path, f"frames[{i}]", frame, document) for i, frame in enumerate(frames)]
+    entries: list[FrameEntry] = []
+    with faults.of("json"):
+        document = read_json(path)
+        frames = document.get("frames")
+        if not isinstance(frames, list):
+            raise InputError(path, "frames", "a list of frames", found_entry(frames))
+        with faults.of("check"):
+            check_lenses(path, document)
+        for index, frame in enumerate(frames):
+            with faults.of("frame", frame):
+                entries.append(parse_frame(path, f"frames[{index}]", frame, document))
+    return entries
 
 
 def check_lenses(path: Path, document: Mapping[str, Any]) -> None:

@@ -19,13 +19,17 @@ from ...bench.progress import counted
 from ..clip import CaptureClip
 from .content_digests import digests_of_same_size
 from .layout import parse_sequence_folder
-from .transforms import FrameEntry, timesteps_of
+from .transforms import RAISED, Faults, FrameEntry, timesteps_of
 
 LeakPolicy = Literal["error", "record"]
 
 
 def check_images(
-    entries: Sequence[FrameEntry], *, decode: bool = False, progress: Progress = no_progress
+    entries: Sequence[FrameEntry],
+    *,
+    decode: bool = False,
+    faults: Faults = RAISED,
+    progress: Progress = no_progress,
 ) -> dict[Path, ImageInfo]:
     """Check that every image and mask exists, is complete, and has the size declared by its frame.
 
@@ -37,18 +41,17 @@ def check_images(
     Returns
     -------
     dict[Path, ImageInfo]
-        Image headers by path; masks are checked but not included.
+        Headers of the images and masks by path.
     """
     infos: dict[Path, ImageInfo] = {}
     for done, entry in enumerate(entries, start=1):
-        info = _probe_referenced(entry, entry.image, "file_path", decode)
-        width, height = entry.width or info.width, entry.height or info.height
-        _check_size(entry, entry.image, info, width, height)
-        infos[entry.image] = info
-        if entry.mask is not None:
-            _check_size(
-                entry, entry.mask, _probe_referenced(entry, entry.mask, "fg_mask_path", decode), width, height
-            )
+        for path, key in ((entry.image, "file_path"), (entry.mask, "fg_mask_path")):
+            if path is not None and path not in infos:
+                with faults.of("file"):
+                    infos[path] = _probe_referenced(entry, path, key, decode)
+            if path in infos and entry.image in infos:
+                with faults.of("check"):
+                    _check_size(entry, path, infos[path], infos[entry.image])
         progress(done, len(entries), "checking images")
     return infos
 
@@ -63,7 +66,8 @@ def _probe_referenced(entry: FrameEntry, path: Path, key: str, decode: bool) -> 
     return probe_image(path, decode=decode)
 
 
-def _check_size(entry: FrameEntry, path: Path, info: ImageInfo, width: int, height: int) -> None:
+def _check_size(entry: FrameEntry, path: Path, info: ImageInfo, image: ImageInfo) -> None:
+    width, height = entry.width or image.width, entry.height or image.height
     if (info.width, info.height) != (width, height):
         expected = f"{width}x{height} pixels as {entry.file.name} {entry.where} says"
         raise InputError(path, "", expected, f"{info.width}x{info.height}")

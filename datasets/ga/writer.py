@@ -24,6 +24,7 @@ from ...bench.io.images import probe_image
 from ..head.arrays import HeadArrays, save_head
 from ..images import write_image
 from . import layout
+from .tracking import pose_to_parameters
 from .transforms import read_transforms
 
 
@@ -354,21 +355,6 @@ class CaptureWriter:
             synthetic=self.plan.synthetic,
             cut=self.plan.cut,
         )
-
-
-def pose_to_parameters(pose: HeadPose) -> dict[str, FloatArray]:
-    """Per-timestep part of a ``flame_param`` file, float32; the additional ``eyelids`` only if the pose has them."""
-    parameters = {
-        "translation": pose.translation,
-        "rotation": pose.rotation,
-        "neck_pose": pose.neck,
-        "jaw_pose": pose.jaw,
-        "eyes_pose": pose.eyes,
-        "expr": pose.expression,
-    }
-    if pose.eyelids is not None:
-        parameters["eyelids"] = pose.eyelids
-    return {key: np.asarray(value, dtype=np.float32)[None] for key, value in parameters.items()}
 
 
 def identity_parameters(shape: FloatArray, static_offset: FloatArray) -> dict[str, FloatArray]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from ...bench.contracts import Clip, HeadAsset, no_progress
 from ..clip import as_capture
 from .catalogue import RULES
-from .evidence import gather_clip
+from .evidence import Evidence
 from .rules import Finding, apply
 from .settings import LintSettings
 
@@ -39,17 +39,19 @@ def errors(clip: Clip) -> list[str]:
         or (rule.severity == "error" and not rule.refused and not (recorded and rule.code.startswith(SPLITS)))
     ]
     folder = Path(clip.subject)
-    evidence = gather_clip(folder, as_capture(clip), LintSettings(views=VIEWS), no_progress, before_run=True)
+    evidence = Evidence.of_clip(
+        folder, as_capture(clip), LintSettings(views=VIEWS), no_progress, before_run=True
+    )
     errors = []
-    for found in apply(rules, evidence):
-        text = f"{found.code}: {found.message}{_where(found)}. {found.remedy}"
-        if found.severity == "error":
+    for finding in apply(rules, evidence):
+        text = f"{finding.code}: {finding.message}{_where(finding)}. {finding.remedy}"
+        if finding.severity == "error":
             errors.append(text)
         else:
             log.warning("%s: %s", clip.subject, text)
     return errors
 
 
-def _where(found: Finding) -> str:
+def _where(finding: Finding) -> str:
     """The file, if it is one."""
-    return f" ({os.path.normpath(found.file)})" if os.path.isabs(found.file) else ""
+    return f" ({os.path.normpath(finding.file)})" if os.path.isabs(finding.file) else ""

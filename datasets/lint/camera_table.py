@@ -17,14 +17,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ...bench.contracts import Camera, FloatArray, Progress
+from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.protocol import evenly_with_ends
-from ..ga.layout import CyConvention
 from ..ga.transforms import FrameEntry
 from ..head.geometry import project, vertex_normals
-from .mesh import Parameters, TrackedSubject
-from .views import BLANK_LEVELS, Pixels, entry_camera, structure
+from .capture import Capture, TrackedSubject
+from .views import BLANK_LEVELS, structure
 
 WORKING_HEIGHT = 400
 """Maximum height of compared images, pixels."""
@@ -59,55 +58,36 @@ _CANDIDATES = 6
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """Measurements of one camera; NaN if not available.
-
-    Attributes
-    ----------
-    level : float
-        Mean grey level, 0 to 255.
-    contrast : float
-        Largest `structure` of its images, grey levels: about 0 for images of one colour.
-    motion : float
-        Largest `structure` of the difference of two of its images, grey levels: about 0 for a frozen
-        image.
-    match : float
-        Correlation, -1 to 1, of the face's brightness with the other cameras', at the best offset.
-    offset : tuple[float, float]
-        (2,) pixels right and down from the projected face to the face in the image.
-    metres_per_pixel, degrees_per_pixel : float
-        Pixel size at the head's distance.
-    height, scale : int, float
-        Image height in pixels, and its ratio to the height of the images measured.
-    lag : int
-        Frames by which its images are late (positive) or early, whole.
-    unsteady, unsteady_at_lag : float
-        Median distance in pixels of the offsets over time from their median, without a lag and with
-        it.
-    sharpness : float
-        log2 of the contrast of fine details of the face relative to the other cameras.
-    fits : str
-        If its own calibration is in doubt, the camera whose calibration matches the images better,
-        otherwise "".
-    fits_match : float
-        Correlation under that calibration.
-    """
+    """Measurements of one camera; NaN if not available."""
 
     frames: int
     level: float
+    """Mean grey level, 0 to 255."""
     contrast: float
+    """Largest `structure` of its images, grey levels: about 0 for images of one colour."""
     motion: float
+    """Largest `structure` of the difference of two of its images, grey levels: about 0 for a frozen image."""
     match: float = np.nan
+    """Correlation, -1 to 1, of the face's brightness with the other cameras', at the best offset."""
     offset: tuple[float, float] = (np.nan, np.nan)
+    """(2,) pixels right and down from the projected face to the face in the image."""
     metres_per_pixel: float = np.nan
     degrees_per_pixel: float = np.nan
+    """Pixel size at the head's distance, in both units."""
     height: int = 0
     scale: float = 1.0
+    """Image height in pixels, and its ratio to the height of the images measured."""
     lag: int = 0
+    """Frames by which its images are late (positive) or early, whole."""
     unsteady: float = np.nan
     unsteady_at_lag: float = np.nan
+    """Median distance in pixels of the offsets over time from their median, without a lag and with it."""
     sharpness: float = np.nan
+    """log2 of the contrast of fine details of the face relative to the other cameras."""
     fits: str = ""
+    """If its own calibration is in doubt, the camera whose calibration matches the images better, otherwise ""."""
     fits_match: float = np.nan
+    """Correlation under that calibration."""
 
 
 class _Shot(NamedTuple):
@@ -118,7 +98,7 @@ class _Shot(NamedTuple):
     grey: FloatArray
     smooth: FloatArray
     fine: FloatArray  # squared contrast of fine details
-    shown: np.ndarray
+    foreground: np.ndarray
     scale: float  # pixels of the image in one of the working size
 
 
@@ -130,33 +110,25 @@ class _Picked(NamedTuple):
     smooth: FloatArray  # the image
 
 
-def measure_cameras(
-    entries: Sequence[FrameEntry],
-    pixels: Pixels,
-    subject: TrackedSubject | None,
-    parameters: Mapping[int, Parameters],
-    cy: CyConvention,
-    *,
-    timesteps: int,
-    progress: Progress,
-) -> dict[str, CameraFacts]:
+def measure_cameras(capture: Capture, timesteps: int) -> dict[str, CameraFacts]:
     """Measure every camera on up to ``timesteps`` timesteps: those in which the head moves most, spread over time."""
+    entries = capture.imaged_entries
     cameras = sorted({entry.camera_id for entry in entries})
-    chosen = _pick_timesteps(entries, subject, parameters, timesteps)
+    chosen = _pick_timesteps(capture, entries, timesteps)
     wanted = [entry for entry in entries if entry.timestep in chosen]
     shots: dict[str, dict[int, _Shot]] = {camera: {} for camera in cameras}
     for done, entry in enumerate(wanted, start=1):
-        progress(done, len(wanted), "measuring cameras")
+        capture.progress(done, len(wanted), "measuring cameras")
         try:
-            shot = _shoot(entry, pixels, cy)
+            shot = _shoot(capture, entry)
         except InputError:
             continue  # reported as a damaged file
         shots[entry.camera_id].setdefault(entry.timestep, shot)
     facts = {camera: _plain([*taken.values()]) for camera, taken in shots.items() if taken}
     live = [c for c, f in facts.items() if f.contrast >= BLANK_LEVELS and c not in frozen(facts)]
-    if subject is None or len(live) < FEWEST_CAMERAS or not any(_posed(parameters, t) for t in chosen):
+    if capture.subject is None or len(live) < FEWEST_CAMERAS or not any(map(capture.pose, chosen)):
         return facts
-    table = _Table(subject, parameters, {camera: shots[camera] for camera in live}, chosen)
+    table = _Table(capture, capture.subject, {camera: shots[camera] for camera in live}, chosen)
     compared = {camera: table.compared(camera, facts[camera], live) for camera in live}
     doubted = _doubted(compared)
     trusted = [camera for camera in live if camera not in doubted]
@@ -194,12 +166,7 @@ def _doubted(facts: Mapping[str, CameraFacts]) -> list[str]:
     ]
 
 
-def _pick_timesteps(
-    entries: Sequence[FrameEntry],
-    subject: TrackedSubject | None,
-    parameters: Mapping[int, Parameters],
-    count: int,
-) -> dict[int, list[int]]:
+def _pick_timesteps(capture: Capture, entries: Sequence[FrameEntry], count: int) -> dict[int, list[int]]:
     """Timesteps to measure and, for each lag from -`MAX_LAG` to `MAX_LAG`, the timesteps of the poses.
 
     From each of ``count`` equal parts of the capture, the timestep with the fastest head motion is selected.
@@ -211,44 +178,38 @@ def _pick_timesteps(
     for present in sequences.values():
         for timestep in present:
             steps = [timestep - lag for lag in range(-MAX_LAG, MAX_LAG + 1)]
-            around[timestep] = [t if t in present and _posed(parameters, t) else -1 for t in steps]
+            around[timestep] = [t if t in present and capture.pose(t) else -1 for t in steps]
     chosen = []
-    for part in np.array_split(sorted(around), max(1, min(count, len(around)))):
-        if len(part):
-            few = evenly_with_ends(part.tolist(), _CANDIDATES)
-            chosen.append(max(few, key=lambda t: _speed(subject, parameters, around[t])))
+    for block in np.array_split(sorted(around), max(1, min(count, len(around)))):
+        if len(block):
+            few = evenly_with_ends(block.tolist(), _CANDIDATES)
+            chosen.append(max(few, key=lambda t: _speed(capture, around[t])))
     return {timestep: around[timestep] for timestep in chosen}
 
 
-def _posed(parameters: Mapping[int, Parameters], timestep: int) -> bool:
-    return timestep in parameters and parameters[timestep].pose is not None
-
-
-def _speed(
-    subject: TrackedSubject | None, parameters: Mapping[int, Parameters], around: Sequence[int]
-) -> float:
+def _speed(capture: Capture, around: Sequence[int]) -> float:
     """Mean motion of vertices over the timesteps around each one, metres; -1 at the ends of a sequence."""
     before, after = around[MAX_LAG + 1], around[MAX_LAG - 1]
-    if subject is None or before < 0 or after < 0:
+    if capture.subject is None or before < 0 or after < 0:
         return -1.0
-    poses = [p for p in (parameters[before].pose, parameters[after].pose) if p is not None]
-    one, other = subject.meshes(poses)
+    poses = [pose for pose in (capture.pose(before), capture.pose(after)) if pose is not None]
+    one, other = capture.subject.meshes(poses)
     return float(np.linalg.norm(one - other, axis=1).mean())
 
 
-def _shoot(entry: FrameEntry, pixels: Pixels, cy: CyConvention) -> _Shot:
-    image, mask = pixels.image(entry), pixels.mask(entry)
-    camera = entry_camera(entry, pixels.headers[entry.image], cy)
+def _shoot(capture: Capture, entry: FrameEntry) -> _Shot:
+    image, mask = capture.pixels.image(entry), capture.pixels.mask(entry)
+    camera = capture.camera(entry)
     scale = min(1.0, WORKING_HEIGHT / camera.height)
     size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
     grey = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32).mean(axis=2)
-    shown = np.ones(grey.shape, dtype=bool)
+    foreground = np.ones(grey.shape, dtype=bool)
     if mask is not None and (mask > 250).mean() > 0.02:
-        shown = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 250
+        foreground = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > 250
     smooth = cv2.GaussianBlur(grey, (0, 0), FINE_SIGMAS[0])
     details = smooth - cv2.GaussianBlur(grey, (0, 0), FINE_SIGMAS[1])
     fine = cv2.GaussianBlur(details * details, (0, 0), FINE_SIGMAS[1])
-    return _Shot(entry, camera.resized(*size), grey, smooth, fine, shown, camera.height / size[1])
+    return _Shot(entry, camera.resized(*size), grey, smooth, fine, foreground, camera.height / size[1])
 
 
 def _plain(shots: Sequence[_Shot]) -> CameraFacts:
@@ -261,7 +222,7 @@ def _plain(shots: Sequence[_Shot]) -> CameraFacts:
     return CameraFacts(
         frames=len(shots),
         level=float(np.mean([shot.grey.mean() for shot in shots])),
-        contrast=max(structure(shot.grey, shot.shown) for shot in shots),
+        contrast=max(structure(shot.grey, shot.foreground) for shot in shots),
         motion=max(motion, default=np.nan),
     )
 
@@ -271,8 +232,8 @@ class _Table:
 
     def __init__(
         self,
+        capture: Capture,
         subject: TrackedSubject,
-        parameters: Mapping[int, Parameters],
         shots: Mapping[str, Mapping[int, _Shot]],
         around: Mapping[int, Sequence[int]],
     ) -> None:
@@ -281,7 +242,7 @@ class _Table:
         self.shots = {c: {t: s for t, s in taken.items() if t in posed} for c, taken in shots.items()}
         self.shots = {camera: taken for camera, taken in self.shots.items() if taken}
         needed = sorted({t for steps in self.around.values() for t in steps if t >= 0})
-        poses = [parameters[t].pose for t in needed]
+        poses = [capture.pose(t) for t in needed]
         meshes = dict(zip(needed, subject.meshes([pose for pose in poses if pose is not None])))
         self.points = {t: mesh[self.members] for t, mesh in meshes.items()}
         self.normals = {t: vertex_normals(meshes[t], subject.head.faces)[self.members] for t in self.around}
@@ -334,20 +295,20 @@ class _Table:
         if camera not in self.picked or not others:
             return plain
         wanted = _median([self.values[other] for other in others])
-        found = {t: _register(picked, wanted) for t, picked in self.picked[camera].items()}
-        known = {t: register for t, register in found.items() if register is not None}
-        if not known:
+        results = {t: _register(picked, wanted) for t, picked in self.picked[camera].items()}
+        registers = {t: register for t, register in results.items() if register is not None}
+        if not registers:
             return plain
-        shot = self.shots[camera][next(iter(known))]
-        centre = self.points[next(iter(known))].mean(axis=0)
+        shot = self.shots[camera][next(iter(registers))]
+        centre = self.points[next(iter(registers))].mean(axis=0)
         focal = float(shot.camera.K[0, 0]) * shot.scale
         distance = float(np.linalg.norm(shot.camera.center - centre))
         lag, unsteady, at_lag, offset = self._lag(
-            camera, {t: register.offset for t, register in known.items()}
+            camera, {t: register.offset for t, register in registers.items()}
         )
         return replace(
             plain,
-            match=float(np.median([register.score for register in known.values()])),
+            match=float(np.median([register.score for register in registers.values()])),
             offset=(float(offset[0]) * shot.scale, float(offset[1]) * shot.scale),
             metres_per_pixel=distance / focal,
             degrees_per_pixel=float(np.degrees(1 / focal)),
@@ -356,7 +317,9 @@ class _Table:
             lag=lag,
             unsteady=unsteady * shot.scale,
             unsteady_at_lag=at_lag * shot.scale,
-            sharpness=self._sharpness(camera, others, {t: register.offset for t, register in known.items()}),
+            sharpness=self._sharpness(
+                camera, others, {t: register.offset for t, register in registers.items()}
+            ),
         )
 
     def _lag(self, camera: str, offsets: Mapping[int, FloatArray]) -> tuple[int, float, float, FloatArray]:
@@ -365,11 +328,11 @@ class _Table:
         for lag in range(-MAX_LAG, MAX_LAG + 1):
             rest = []
             for timestep, offset in offsets.items():
-                shown = self.around[timestep][lag + MAX_LAG]
+                delayed = self.around[timestep][lag + MAX_LAG]
                 picked, view = self.picked[camera][timestep], self.shots[camera][timestep].camera
-                if shown < 0 or not picked.seen.any():
+                if delayed < 0 or not picked.seen.any():
                     continue
-                moved = project(self.points[shown][picked.seen], view) - picked.pixels[picked.seen]
+                moved = project(self.points[delayed][picked.seen], view) - picked.pixels[picked.seen]
                 rest.append(offset - np.median(moved, axis=0))
             if len(rest) > len(offsets) / 2:
                 middle = np.median(rest, axis=0)
@@ -384,12 +347,13 @@ class _Table:
         for timestep in [*self.picked[camera]][::3]:
             for other, taken in self.shots.items():
                 if other != camera and timestep in taken:
-                    place = taken[timestep].camera
+                    calibration = taken[timestep].camera
                     shot = self.shots[camera][timestep]
-                    if (place.width, place.height) == (shot.camera.width, shot.camera.height):
-                        found = _register(self.pick(shot, timestep, place), wanted, 0.25 * REACH, levels=1)
-                        if found is not None:
-                            scores[other].append(found.score)
+                    if (calibration.width, calibration.height) == (shot.camera.width, shot.camera.height):
+                        picked = self.pick(shot, timestep, calibration)
+                        register = _register(picked, wanted, 0.25 * REACH, levels=1)
+                        if register is not None:
+                            scores[other].append(register.score)
         if not scores:
             return "", np.nan
         best = max(scores, key=lambda other: float(np.median(scores[other])))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from . import checks_cameras, checks_files, checks_images, checks_rig, checks_tracking
+from . import checks_cameras, checks_files, checks_images, checks_tracking
 from .rules import Rule
 
 GROUPS = {
@@ -18,10 +18,10 @@ GROUPS = {
 
 RULES = sorted(
     (
-        found
-        for checks in (checks_cameras, checks_files, checks_images, checks_rig, checks_tracking)
-        for found in vars(checks).values()
-        if isinstance(found, Rule)
+        rule
+        for checks in (checks_cameras, checks_files, checks_images, checks_tracking)
+        for rule in vars(checks).values()
+        if isinstance(rule, Rule)
     ),
-    key=lambda found: found.code,
+    key=lambda rule: rule.code,
 )

@@ -12,9 +12,10 @@ from ...bench.io.files import entries
 from ...bench.progress import counted
 from ..ga import layout
 from ..ga.transforms import FrameEntry
+from .capture import Slot
+from .checks_cameras import dead_cameras
 from .checks_images import unit_range
-from .checks_rig import dead_cameras
-from .evidence import Evidence, Slot
+from .evidence import Evidence
 from .rules import Hit, at, rule, some, spans
 from .views import Thumbnail, near_duplicates
 
@@ -42,7 +43,7 @@ def _refused(evidence: Evidence) -> Iterator[Hit]:
     Fix the other findings first; `headbench run` stops at this one.
     """
     # Faults reported by another rule are skipped (see `apply` for those at the same place).
-    error = evidence.refusal
+    error = evidence.faults[0].error if evidence.faults else None
     reported = not {"HB103", "HB116"} & {*evidence.settings.ignore}
     missing = error is not None and any(str(fault.file) in error.found for fault in evidence.file_faults)
     missing = missing and reported
@@ -57,7 +58,7 @@ def _broken_json(evidence: Evidence) -> Iterator[Hit]:
 
     Export the capture again, or restore the file.
     """
-    yield from _faults((*evidence.json_faults, *evidence.declaration_faults), "file")
+    yield from _faults([*evidence.faults.errors("json"), *evidence.faults.errors("declaration")], "file")
 
 
 @rule("HB102", "error", of_layout=True, refused=True)
@@ -66,8 +67,8 @@ def _broken_frame(evidence: Evidence) -> Iterator[Hit]:
 
     Export the capture again, or fix the entry.
     """
-    others = [error for error in evidence.frame_faults if not error.key.endswith(".transform_matrix")]
-    yield from _faults(others, "frame")
+    errors = evidence.faults.errors("frame")
+    yield from _faults((e for e in errors if not e.key.endswith(".transform_matrix")), "frame")
 
 
 @rule("HB103", "error")
@@ -100,13 +101,13 @@ def _missing_file(evidence: Evidence) -> Iterator[Hit]:
 
 def _absolute_elsewhere(evidence: Evidence) -> dict[str, tuple[FrameEntry, str]]:
     """Missing files with absolute paths, with the frame and the key that name them."""
-    found: dict[str, tuple[FrameEntry, str]] = {}
+    places: dict[str, tuple[FrameEntry, str]] = {}
     for entry in evidence.entries:
         named = {"file_path": entry.image, "fg_mask_path": entry.mask, "flame_param_path": entry.parameters}
         for key, path in named.items():
             if path is not None and not path.is_relative_to(entry.file.parent) and not os.path.exists(path):
-                found.setdefault(str(path), (entry, key))
-    return found
+                places.setdefault(str(path), (entry, key))
+    return places
 
 
 @rule("HB116", "error", of_layout=True, refused=True)
@@ -116,11 +117,11 @@ def _absolute_paths(evidence: Evidence) -> Iterator[Hit]:
     Write paths relative to the folder of the JSON, such as ../SEQUENCE/images/00000_00.png, which stay valid when the
     export is copied.
     """
-    found = _absolute_elsewhere(evidence)
-    if found:
-        path, (entry, key) = next(iter(found.items()))
+    places = _absolute_elsewhere(evidence)
+    if places:
+        path, (entry, key) = next(iter(places.items()))
         yield Hit(
-            f"{counted(len(found), 'file')} named by absolute paths that this machine does not have, such as {path}",
+            f"{counted(len(places), 'file')} named by absolute paths that this machine does not have, such as {path}",
             *at(entry, key),
         )
 
@@ -138,14 +139,14 @@ def _wrong_size(evidence: Evidence) -> Iterator[Hit]:
             info = evidence.headers.get(path) if path is not None else None
             if info is None or image is None:
                 continue
-            expected = (entry.width or image.width, entry.height or image.height)
-            if (info.width, info.height) != expected:
-                wrong.append((path, (info.width, info.height), expected, entry))
+            stated = (entry.width or image.width, entry.height or image.height)
+            if (info.width, info.height) != stated:
+                wrong.append((path, (info.width, info.height), stated, entry))
     if wrong:
-        path, found, expected, entry = wrong[0]
+        path, size, stated, entry = wrong[0]
         yield Hit(
-            f"{counted(len(wrong), 'file')} of another size than stated: {found[0]}x{found[1]} pixels where "
-            f"{entry.where} of {entry.file.name} says {expected[0]}x{expected[1]}",
+            f"{counted(len(wrong), 'file')} of another size than stated: {size[0]}x{size[1]} pixels where "
+            f"{entry.where} of {entry.file.name} says {stated[0]}x{stated[1]}",
             path or "",
         )
 
@@ -212,8 +213,8 @@ def _stray_exclusion(evidence: Evidence) -> Iterator[Hit]:
     """
     if evidence.declaration is None:
         return
-    known = {e.timestep for e in evidence.entries} | {slot.timestep for slot in evidence.unread}
-    stray = sorted(set(evidence.declaration.excluded) - known)
+    timesteps = {e.timestep for e in evidence.entries} | {slot.timestep for slot in evidence.unread}
+    stray = sorted(set(evidence.declaration.excluded) - timesteps)
     if stray:
         file = evidence.folder / layout.DECLARATION_FILE
         yield Hit(f"timesteps {spans(stray)} are excluded and not in the capture", file, "excluded")
@@ -227,10 +228,10 @@ def _unreasoned(evidence: Evidence) -> Iterator[Hit]:
     """
     if evidence.declaration is None:
         return
-    bare = [t for t, reason in evidence.declaration.excluded.items() if not reason.strip()]
-    if bare:
+    unreasoned = [t for t, reason in evidence.declaration.excluded.items() if not reason.strip()]
+    if unreasoned:
         file = evidence.folder / layout.DECLARATION_FILE
-        yield Hit(f"timesteps {spans(bare)} are excluded without a reason", file, "excluded")
+        yield Hit(f"timesteps {spans(unreasoned)} are excluded without a reason", file, "excluded")
 
 
 @rule("HB110", "warning")
@@ -246,11 +247,11 @@ def _short_test(evidence: Evidence) -> Iterator[Hit]:
     for entry in evidence.splits.get("self_reenactment", ()):
         timesteps[entry.sequence_folder].add(entry.timestep)
     for folder, present in timesteps.items():
-        kept = len(present - excluded)
-        if kept < least:
+        count = len(present - excluded)
+        if count < least:
             left_out = f" ({len(present & excluded)} excluded)" if present & excluded else ""
             yield Hit(
-                f"test sequence {evidence.names[folder]} has {counted(kept, 'timestep')}{left_out}, "
+                f"test sequence {evidence.names[folder]} has {counted(count, 'timestep')}{left_out}, "
                 f"fewer than {least}",
                 evidence.split_file("self_reenactment"),
             )
@@ -263,9 +264,9 @@ def _empty_split(evidence: Evidence) -> Iterator[Hit]:
 
     Hold out a camera for novel views and a sequence for self-reenactment.
     """
-    cameras = {entry.camera_id for part in evidence.splits.values() for entry in part}
+    cameras = {entry.camera_id for entry in evidence.entries}
     needed = [name for name in layout.SPLIT_FILES if name != "novel_view" or len(cameras) > 1]
-    faulty = {error.file for error in (*evidence.json_faults, *evidence.frame_faults)}
+    faulty = {error.file for error in evidence.faults.errors("json", "frame")}
     files = {name: evidence.split_file(name) for name in needed}
     empty = [
         name for name, path in files.items() if not evidence.splits.get(name) and str(path) not in faulty
@@ -281,7 +282,7 @@ def _undeclared(evidence: Evidence) -> Iterator[Hit]:
     Write headbench.json beside the JSONs (its keys are listed in the documentation under "Captures and head models"), so that
     nothing has to be inferred.
     """
-    if evidence.declaration is None and not evidence.declaration_faults:
+    if evidence.declaration is None and not evidence.faults.errors("declaration"):
         yield Hit(
             "no declaration of background, head model, principal point and sequence names: white, the given "
             "head, the images' own evidence and the folders' names are taken",
@@ -295,18 +296,18 @@ def _orphans(evidence: Evidence) -> Iterator[Hit]:
 
     Delete them, or add them to a split if they should be used.
     """
-    named = {entry.image for entry in evidence.entries}
+    named = {entry.image for entry in evidence.entries if os.path.exists(entry.image)}
     folders = {entry.image.parent for entry in evidence.entries}
     # Frames that do not parse refer to unknown images.
-    if evidence.unread or evidence.frame_faults or evidence.json_faults:
+    if evidence.faults.errors("json", "frame"):
         return
-    known = {path.resolve() for path in named}
+    resolved = {path.resolve() for path in named}
     orphans = sorted(
         path
         for folder in folders
         if folder.is_dir()
         for path in entries(folder)
-        if path.suffix.lower() in IMAGE_SUFFIXES and path.resolve() not in known
+        if path.suffix.lower() in IMAGE_SUFFIXES and path.resolve() not in resolved
     )
     if orphans:
         yield Hit(f"{counted(len(orphans), 'image')} that no split names", orphans[0])
@@ -318,11 +319,11 @@ def _uneven_masks(evidence: Evidence) -> Iterator[Hit]:
 
     Export all masks: regions and masked metrics would cover only a part of the frames.
     """
-    bare = [entry for entry in evidence.entries if entry.mask is None]
-    share = len(bare) / max(1, len(evidence.entries))
+    unmasked = [entry for entry in evidence.entries if entry.mask is None]
+    share = len(unmasked) / max(1, len(evidence.entries))
     if 0 < share < 1:
-        text = f"{counted(len(bare), 'frame')} of {len(evidence.entries)} name no mask, the others do"
-        yield Hit(text, *at(bare[0], "fg_mask_path"))
+        text = f"{counted(len(unmasked), 'frame')} of {len(evidence.entries)} name no mask, the others do"
+        yield Hit(text, *at(unmasked[0], "fg_mask_path"))
 
 
 @rule("HB115", "note")
@@ -349,11 +350,11 @@ def _same_images(evidence: Evidence) -> Iterator[Hit]:
     # By content, which includes files that are listed twice.
     dead = dead_cameras(evidence)  # all of their images are the same
     contents: dict[str, dict[str, FrameEntry]] = {}
-    for split, part in evidence.splits.items():
-        held = contents.setdefault(split, {})
-        for entry in part:
+    for split, frames in evidence.splits.items():
+        images = contents.setdefault(split, {})
+        for entry in frames:
             if entry.image in evidence.digests and entry.camera_id not in dead:
-                held.setdefault(evidence.digests[entry.image], entry)
+                images.setdefault(evidence.digests[entry.image], entry)
     for one, other in combinations(contents, 2):
         shared = sorted(contents[one].keys() & contents[other].keys())
         if shared:
@@ -430,10 +431,10 @@ def _twice(evidence: Evidence) -> Iterator[Hit]:
 
     Delete the second entry: it would be trained on or counted twice.
     """
-    for split, part in evidence.splits.items():
+    for split, frames in evidence.splits.items():
         seen: set[tuple[int, str]] = set()
         twice = []
-        for entry in part:
+        for entry in frames:
             slot = (entry.timestep, entry.camera_id)
             if slot in seen:
                 twice.append(entry)

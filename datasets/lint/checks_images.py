@@ -7,13 +7,13 @@ background.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from ...bench.progress import counted
-from .checks_rig import blank_cameras, faulty_cameras
+from .checks_cameras import blank_cameras, faulty_cameras
 from .evidence import Evidence, first_entries
 from .rules import Hit, rule, some
 from .views import BACKGROUND_LEVELS, MaskFacts, ViewFacts
@@ -26,11 +26,6 @@ DIRTY = 0.02
 
 FRINGES = (0.65, 1.5)
 """Fringes between these are a clean composite, see `MaskFacts.fringe`."""
-
-BLANK_COVERAGE = 0.001
-
-MASK_LEVELS = (12, 240)
-"""Maximum level of what is outside a mask, and minimum level of what is inside."""
 
 LIMITED_LOW, LIMITED_HIGH = (14, 24), (231, 237)
 """Expected range of the minimum and maximum level of limited-range images; resizing softens the ends a
@@ -48,34 +43,9 @@ def _masks(evidence: Evidence) -> list[tuple[ViewFacts, MaskFacts]]:
     return [(v, v.mask) for v in evidence.views if v.mask is not None and v.entry.camera_id not in blank]
 
 
-def _other_levels(mask: MaskFacts) -> bool:
-    """Whether nothing is covered fully, or everything a little."""
-    return 0 < mask.high < MASK_LEVELS[1] or MASK_LEVELS[0] < mask.low <= 127
-
-
-def _empty(mask: MaskFacts) -> bool:
-    return mask.coverage < BLANK_COVERAGE and not _other_levels(mask)
-
-
-def _full(mask: MaskFacts) -> bool:
-    return mask.low > 127
-
-
-def _inverted(mask: MaskFacts) -> bool:
-    return not _full(mask) and mask.inside_empty > 0.5 and mask.outside_off > 0.3
-
-
-def _sound(mask: MaskFacts) -> bool:
-    return not (_other_levels(mask) or _empty(mask) or _full(mask) or _inverted(mask))
-
-
-def sound_mask(view: ViewFacts) -> bool:
-    """Whether a frame has a mask that the geometry can be compared with."""
-    return view.mask is not None and _sound(view.mask)
-
-
-def _faulty_masks(evidence: Evidence, is_faulty: Callable[[MaskFacts], bool], what: str) -> Iterator[Hit]:
-    faulty = [view for view, mask in _masks(evidence) if is_faulty(mask)]
+def _faulty_masks(evidence: Evidence, fault: str, what: str) -> Iterator[Hit]:
+    """One hit for the masks with a fault, a property of `MaskFacts`."""
+    faulty = [view for view, mask in _masks(evidence) if getattr(mask, fault)]
     if faulty:
         path = faulty[0].entry.mask or faulty[0].entry.image
         yield Hit(f"{what} in {len(faulty)} of {counted(len(evidence.views), 'frame')} checked", path)
@@ -87,11 +57,11 @@ def _mask_levels(evidence: Evidence) -> Iterator[Hit]:
 
     Scale it before saving: masks of 0 and 1 by 255, of video's limited range from 16 and 235.
     """
-    found = [mask for _, mask in _masks(evidence) if _other_levels(mask)]
-    if found:
-        low, high = min(mask.low for mask in found), max(mask.high for mask in found)
+    masks = [mask for _, mask in _masks(evidence) if mask.other_levels]
+    if masks:
+        low, high = min(mask.low for mask in masks), max(mask.high for mask in masks)
         what = f"the mask's levels lie from {low} to {high}, not from 0 to 255,"
-        yield from _faulty_masks(evidence, _other_levels, what)
+        yield from _faulty_masks(evidence, "other_levels", what)
 
 
 @rule("HB304", "error")
@@ -100,7 +70,7 @@ def _empty_masks(evidence: Evidence) -> Iterator[Hit]:
 
     Run the matting again for these frames, or exclude them with a reason.
     """
-    yield from _faulty_masks(evidence, _empty, "the mask covers nothing")
+    yield from _faulty_masks(evidence, "empty", "the mask covers nothing")
 
 
 @rule("HB305", "error")
@@ -109,7 +79,7 @@ def _full_masks(evidence: Evidence) -> Iterator[Hit]:
 
     Run the matting again; failed matting gives a mask of 255 everywhere.
     """
-    yield from _faulty_masks(evidence, _full, "the mask covers the whole image")
+    yield from _faulty_masks(evidence, "full", "the mask covers the whole image")
 
 
 @rule("HB306", "error")
@@ -118,7 +88,7 @@ def _inverted_masks(evidence: Evidence) -> Iterator[Hit]:
 
     Invert it: 255 is the subject.
     """
-    yield from _faulty_masks(evidence, _inverted, "the mask covers the background and not the subject")
+    yield from _faulty_masks(evidence, "inverted", "the mask covers the background and not the subject")
 
 
 @rule("HB308", "error")
@@ -157,15 +127,15 @@ def _level(evidence: Evidence, camera: str) -> float:
 def outside_colours(evidence: Evidence) -> list[tuple[ViewFacts, np.ndarray, float]]:
     """Frames with a visible background: its median colour, (3,), and the fraction of its pixels that differ from the
     declared one. Images with alpha have none."""
-    found = []
+    colours = []
     for view in evidence.views:
         if view.error is not None or view.has_alpha or view.blank:
             continue
         if view.mask is None and view.corners is not None:
-            found.append((view, np.asarray(view.corners), view.corners_off))
-        elif view.mask is not None and _sound(view.mask) and view.mask.outside is not None:
-            found.append((view, np.asarray(view.mask.outside), view.mask.outside_off))
-    return found
+            colours.append((view, np.asarray(view.corners), view.corners_off))
+        elif view.mask is not None and view.mask.sound and view.mask.outside is not None:
+            colours.append((view, np.asarray(view.mask.outside), view.mask.outside_off))
+    return colours
 
 
 def _foreign(evidence: Evidence, colour: np.ndarray) -> bool:
@@ -180,15 +150,15 @@ def _wrong_background(evidence: Evidence) -> Iterator[Hit]:
     """
     if unit_range(evidence) or limited_range(evidence):
         return
-    seen = [found for found in outside_colours(evidence) if not _shows_room(found[0])]
+    seen = [entry for entry in outside_colours(evidence) if not _shows_room(entry[0])]
     wrong = [(view, colour) for view, colour, _ in seen if _foreign(evidence, colour)]
     if wrong:
-        found = np.median([colour for _, colour in wrong], axis=0).round().astype(int)
+        median = np.median([colour for _, colour in wrong], axis=0).round().astype(int)
         stated = np.round(np.asarray(evidence.background) * 255).astype(int)
         uniform = np.ptp([colour for _, colour in wrong], axis=0).max() <= BACKGROUND_LEVELS
-        shown = f"level {tuple(found.tolist())}" if uniform else "no one colour"
+        colour_text = f"level {tuple(median.tolist())}" if uniform else "no one colour"
         yield Hit(
-            f"declared background is level {tuple(stated.tolist())}, outside the subject there is {shown} in "
+            f"declared background is level {tuple(stated.tolist())}, outside the subject there is {colour_text} in "
             f"{len(wrong)} of {counted(len(seen), 'frame')} checked",
             wrong[0][0].entry.image,
         )
@@ -242,14 +212,14 @@ def _fringes(evidence: Evidence) -> Iterator[Hit]:
     """
     if unit_range(evidence) or any(_foreign(evidence, colour) for _, colour, _ in outside_colours(evidence)):
         return
-    told = [
+    fringes = [
         (view, mask.fringe)
         for view, mask in _masks(evidence)
-        if mask.fringe is not None and _sound(mask) and not view.has_alpha
+        if mask.fringe is not None and mask.sound and not view.has_alpha
     ]
-    if len(told) < 4:
+    if len(fringes) < 4:
         return
-    typical = float(np.median([fringe for _, fringe in told]))
+    typical = float(np.median([fringe for _, fringe in fringes]))
     if not FRINGES[0] <= typical <= FRINGES[1]:
         what = (
             "dark fringes, as of colours premultiplied twice"
@@ -258,8 +228,8 @@ def _fringes(evidence: Evidence) -> Iterator[Hit]:
         )
         yield Hit(
             f"{what}: where the mask is soft, the subject adds {typical:.2f} times the light it should (median "
-            f"over {counted(len(told), 'frame')})",
-            told[0][0].entry.image,
+            f"over {counted(len(fringes), 'frame')})",
+            fringes[0][0].entry.image,
         )
 
 
@@ -295,7 +265,7 @@ def _spans_limited(levels: tuple[int, int]) -> bool:
 SWAPPED_LEVELS = 10
 """Minimum excess of blue over red of skin that indicates swapped channels."""
 
-APART_LEVELS = 30
+BALANCE_LEVELS = 30
 """Difference between the skin colour of a camera and the others above which they are not calibrated to each other."""
 
 
@@ -344,7 +314,7 @@ def skin_by_camera(evidence: Evidence) -> dict[str, np.ndarray]:
         outside = view.mesh.face_outside if view.mesh is not None else None
         if view.mesh is not None and view.mesh.skin is not None and (outside or 0.0) < 0.1 and not view.grey:
             colours[view.entry.camera_id].append(np.asarray(view.mesh.skin))
-    return {camera: np.median(found, axis=0) for camera, found in colours.items()}
+    return {camera: np.median(values, axis=0) for camera, values in colours.items()}
 
 
 def _swapped_cameras(evidence: Evidence) -> list[str]:
@@ -381,12 +351,12 @@ def _uncalibrated(evidence: Evidence) -> Iterator[Hit]:
     if len(balance) < 3:
         return
     middle = np.median([*balance.values()], axis=0)
-    apart = {camera: float(np.abs(value - middle).max()) for camera, value in balance.items()}
-    worst = [camera for camera, levels in apart.items() if levels > APART_LEVELS]
+    distances = {camera: float(np.abs(value - middle).max()) for camera, value in balance.items()}
+    worst = [camera for camera, levels in distances.items() if levels > BALANCE_LEVELS]
     if worst:
         yield Hit(
             f"the skin's colour balance in {some(worst)} differs from the other cameras' by up to "
-            f"{max(apart.values()):.0f} levels",
+            f"{max(distances.values()):.0f} levels",
             evidence.folder,
         )
 

@@ -14,13 +14,10 @@ from ...bench.errors import InputError
 from ...bench.progress import counted
 from ..ga import layout
 from ..novelty import displacement_metric, novelty
-from .checks_cameras import misplaced
-from .checks_images import sound_mask
-from .checks_rig import faulty_cameras
+from .checks_cameras import faulty_cameras, misplaced
 from .evidence import Evidence
-from .mesh import MeshFacts
 from .rules import Hit, rule, some, spans
-from .views import ViewFacts
+from .views import MeshFacts, ViewFacts
 
 STILL = 1e-4
 """Radians, or coefficients: smaller changes over a capture count as none."""
@@ -50,7 +47,7 @@ def _version(evidence: Evidence) -> Iterator[Hit]:
     Give the declared version, or refit the tracking: coefficients of FLAME 2020 and 2023 are not interchangeable,
     although their numbers are equal.
     """
-    for error in evidence.head_faults:
+    for error in evidence.faults.errors("head"):
         if error.key == "head_model":
             text = (
                 f"the head model given is {error.expected.split(',')[0]}, the capture was tracked with "
@@ -91,7 +88,7 @@ def _no_head(evidence: Evidence) -> Iterator[Hit]:
 
     Give its path with --head, or save it at the path in headbench.json.
     """
-    for error in evidence.head_faults:
+    for error in evidence.faults.errors("head"):
         if error.key != "head_model":
             yield Hit(f"expected {error.expected}, found {error.found}", error.file, error.key)
 
@@ -210,16 +207,16 @@ def _untrained_expressions(evidence: Evidence) -> Iterator[Hit]:
     poses = {p.timestep: p.pose.expression for p in evidence.posed if p.pose and p.timestep not in excluded}
     head = evidence.subject.head
     metric = displacement_metric(head.expression_basis[head.regions.get("face", slice(None))])
-    known = [poses[t] for t in sorted(train & poses.keys())]
+    trained = [poses[t] for t in sorted(train & poses.keys())]
     for name, timesteps in test.items():
         new = [poses[t] for t in sorted(timesteps & poses.keys())]
-        if len(known) < FEW or not new:
+        if len(trained) < FEW or not new:
             continue
-        found = novelty(np.stack(known) @ metric, np.stack(new) @ metric)
-        if max(found) > UNTRAINED:
+        share = novelty(np.stack(trained) @ metric, np.stack(new) @ metric)
+        if max(share) > UNTRAINED:
             text = (
-                f"test sequence {name}: {found.outside:.0%} of its expressions lie outside the span of training, "
-                f"{found.beyond:.0%} of its timesteps beyond the range of training"
+                f"test sequence {name}: {share.outside:.0%} of its expressions lie outside the span of training, "
+                f"{share.beyond:.0%} of its timesteps beyond the range of training"
             )
             yield Hit(text, evidence.split_file("self_reenactment"))
 
@@ -341,7 +338,7 @@ MOST_FAR = 0.1
 """Fraction of the foreground far from the mesh above which the mask holds more than a head model explains."""
 
 
-def _laid(evidence: Evidence) -> list[tuple[ViewFacts, MeshFacts, float]]:
+def _comparable(evidence: Evidence) -> list[tuple[ViewFacts, MeshFacts, float]]:
     """Frames whose mesh can be compared with a valid mask, with the fraction of the face outside."""
     if misplaced(evidence):
         return []
@@ -351,15 +348,15 @@ def _laid(evidence: Evidence) -> list[tuple[ViewFacts, MeshFacts, float]]:
         for view in evidence.views
         if view.mesh is not None
         and view.mesh.face_outside is not None
-        and sound_mask(view)
+        and view.has_sound_mask
         and view.entry.camera_id not in faulty
     ]
 
 
 def mesh_misses(evidence: Evidence) -> bool:
     """Whether the face of the mesh is outside the foreground in most frames."""
-    laid = _laid(evidence)
-    return bool(laid) and float(np.median([outside for _, _, outside in laid])) > OUTSIDE
+    views = _comparable(evidence)
+    return bool(views) and float(np.median([outside for _, _, outside in views])) > OUTSIDE
 
 
 @rule("HB701", "error")
@@ -370,12 +367,12 @@ def _missed(evidence: Evidence) -> Iterator[Hit]:
     another subject's tracking, or parameters shifted by some timesteps.
     """
     if mesh_misses(evidence):
-        laid = _laid(evidence)
-        outside = float(np.median([share for _, _, share in laid]))
-        overlap = float(np.median([mesh.overlap or 0.0 for _, mesh, _ in laid]))
+        views = _comparable(evidence)
+        outside = float(np.median([share for _, _, share in views]))
+        overlap = float(np.median([mesh.overlap or 0.0 for _, mesh, _ in views]))
         yield Hit(
             f"{outside:.0%} of the face's vertices fall outside the foreground (median over "
-            f"{counted(len(laid), 'frame')}; mesh and foreground overlap by {overlap:.2f})",
+            f"{counted(len(views), 'frame')}; mesh and foreground overlap by {overlap:.2f})",
             evidence.folder,
         )
 
@@ -388,14 +385,14 @@ def _missed_once(evidence: Evidence) -> Iterator[Hit]:
     """
     if mesh_misses(evidence):
         return
-    laid = _laid(evidence)
-    lost = [(view, outside) for view, _, outside in laid if outside > OUTSIDE]
+    views = _comparable(evidence)
+    lost = [(view, outside) for view, _, outside in views if outside > OUTSIDE]
     if lost:
         timesteps = sorted({view.entry.timestep for view, _ in lost})
         cameras = sorted({view.entry.camera_id for view, _ in lost})
         where = f"camera {cameras[0]}, " if len(cameras) == 1 else ""
         yield Hit(
-            f"the mesh misses the face in {len(lost)} of {counted(len(laid), 'frame')} checked ({where}"
+            f"the mesh misses the face in {len(lost)} of {counted(len(views), 'frame')} checked ({where}"
             f"timesteps {spans(timesteps)})",
             lost[0][0].entry.image,
         )
@@ -407,7 +404,7 @@ def _small(evidence: Evidence) -> Iterator[Hit]:
 
     Check the units; if the mask includes shoulders, cut it below the neck.
     """
-    sizes = [mesh.size for _, mesh, _ in _laid(evidence) if mesh.size is not None]
+    sizes = [mesh.size for _, mesh, _ in _comparable(evidence) if mesh.size is not None]
     if sizes and np.median(sizes) < SMALL:
         yield Hit(
             f"the mesh covers {np.median(sizes):.0%} of the foreground's area (median over "
@@ -425,7 +422,7 @@ def _far_away(evidence: Evidence) -> Iterator[Hit]:
     """
     if mesh_misses(evidence):
         return
-    shares = [mesh.far for _, mesh, _ in _laid(evidence) if mesh.far is not None]
+    shares = [mesh.far for _, mesh, _ in _comparable(evidence) if mesh.far is not None]
     if shares and np.median(shares) > MOST_FAR:
         yield Hit(
             f"{np.median(shares):.0%} of the foreground is far from the mesh (median over {counted(len(shares), 'frame')})",

@@ -56,17 +56,16 @@ def lint_capture(settings: LintSettings, progress: Progress = no_progress) -> tu
     from ..ga.reader import find_capture
     from ..open import find_reader
     from .catalogue import RULES
-    from .evidence import gather, gather_clip
+    from .evidence import Evidence
 
     if find_reader(settings.clip, settings.reader).name == "ga":
         if settings.set:
-            found = ", ".join(settings.set)
             expected = "no settings: of the reader ga, lint looks at the files"
-            raise InputError("command line", "--set", expected, found, "Leave it out.")
-        evidence = gather(find_capture(settings.clip), settings, progress)
+            raise InputError("command line", "--set", expected, ", ".join(settings.set), "Leave it out.")
+        evidence = Evidence.of_files(find_capture(settings.clip), settings, progress)
     else:
         clip = settings.open(settings.clip, progress)
-        evidence = gather_clip(Path(settings.clip), clip, settings, progress)
+        evidence = Evidence.of_clip(Path(settings.clip), clip, settings, progress)
     return evidence, apply(RULES, evidence, settings.ignore, base=evidence.folder.parent)
 
 
@@ -109,13 +108,13 @@ def _report(evidence: Evidence, findings: Sequence[Finding], passed: bool) -> st
         lines.append(f"{finding.code} {finding.severity:<8}  {finding.message}")
         lines += [f"{'':16}{text}" for text in (place, finding.remedy) if text] + [""]
     counts = Counter(finding.severity for finding in findings)
-    found = ", ".join(counted(counts[severity], severity) for severity in SEVERITIES)
-    seen = _looked_at(evidence)
+    counts_text = ", ".join(counted(counts[severity], severity) for severity in SEVERITIES)
+    amounts = _looked_at(evidence)
     lines += [
-        f"{Path(evidence.folder).name}: {found}.",
+        f"{Path(evidence.folder).name}: {counts_text}.",
         (
-            f"Checked {seen['frames']} frames ({seen['timesteps']} timesteps, {seen['cameras']} cameras), decoded "
-            f"{seen['frames_decoded']}, compared {seen['frames_compared_for_near_duplicates']} for near-duplicates."
+            f"Checked {amounts['frames']} frames ({amounts['timesteps']} timesteps, {amounts['cameras']} cameras), decoded "
+            f"{amounts['frames_decoded']}, compared {amounts['frames_compared_for_near_duplicates']} for near-duplicates."
         ),
     ]
     if skipped := _skipped(evidence):

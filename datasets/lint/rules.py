@@ -34,33 +34,22 @@ def at(entry: FrameEntry, key: str) -> tuple[Path, str]:
 
 @dataclass(frozen=True)
 class Rule:
-    """A check with its code.
-
-    Attributes
-    ----------
-    code : str
-        Stable name, "HB" and three digits; the first digit is the subject (see `catalogue`).
-    title : str
-        The fault in a few words.
-    remedy : str
-        How to fix it.
-    check : Callable
-        Function from evidence to hits; no hits if the data that it needs could not be read.
-    of_layout : bool
-        Whether it checks files of the GaussianAvatars/VHAP layout; skipped for captures of other
-        readers.
-    refused : bool
-        Whether the layout's reader refuses a capture with this error. All other errors are searched for
-        before a run, see `before_run`.
-    """
+    """A check with its code."""
 
     code: str
+    """Stable name, "HB" and three digits; the first digit is the subject (see `catalogue`)."""
     severity: Severity
     title: str
+    """The fault in a few words."""
     remedy: str
+    """How to fix it."""
     check: Callable[[Evidence], Iterable[Hit]]
+    """Function from evidence to hits; no hits if the data that it needs could not be read."""
     of_layout: bool = False
+    """Whether it checks files of the GaussianAvatars/VHAP layout; skipped for captures of other readers."""
     refused: bool = False
+    """Whether the layout's reader refuses a capture with this error. All other errors are searched for before a run, see
+    `before_run`."""
 
 
 @dataclass(frozen=True)
@@ -101,16 +90,16 @@ def apply(
         if rule.code not in ignore and (evidence.of_layout or not rule.of_layout)
         for hit in rule.check(evidence)
     ]
-    findings = [finding for finding in findings if not _said_again(finding, findings)]
+    findings = [finding for finding in findings if not _is_repeated(finding, findings)]
     return sorted(findings, key=lambda f: (SEVERITIES.index(f.severity), f.code))
 
 
 REFUSAL = "HB100"
-"""The rule that reports the error of the reader."""
+"""The rule that reports the first error of the reader."""
 
 
-def _said_again(finding: Finding, findings: Sequence[Finding]) -> bool:
-    """Whether it is the error of the reader and another rule reports an error at the same place."""
+def _is_repeated(finding: Finding, findings: Sequence[Finding]) -> bool:
+    """Whether it is the first error of the reader and another rule reports an error at the same place."""
     return finding.code == REFUSAL and any(
         other.code != REFUSAL
         and other.severity == "error"

@@ -90,7 +90,7 @@ def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_pr
 
 def _check_unknown_to_readers(root: Path) -> None:
     """Raise `InputError` if a reader of captures can read the folder directly."""
-    from ...bench.engine.captures import finds, readers
+    from ...bench.registry import finds, readers
 
     for name, spec in readers().items():
         if finds(spec, root):

@@ -51,9 +51,7 @@ def test_readers_of_plug_ins_beside_the_one_that_fits(pristine_capture, monkeypa
 
     def offer(**changes):
         twin = replace(known["ga"], name="other", spec=replace(known["ga"].spec, name="other", **changes))
-        monkeypatch.setattr(
-            "headbench.bench.engine.captures.discover", lambda group: {**known, "other": twin}
-        )
+        monkeypatch.setattr(registry, "discover", lambda group: {**known, "other": twin})
 
     offer()
     with pytest.raises(InputError, match=r"one for ga, other. Choose with --reader"):

@@ -21,7 +21,8 @@ import numpy as np
 from ....bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ....bench.errors import InputError
 from ....bench.io.files import atomic_path, read_bytes, write_bytes, write_text
-from ....datasets.ga.writer import pose_to_parameters, save_npz
+from ....datasets.ga.tracking import pose_to_parameters
+from ....datasets.ga.writer import save_npz
 from ....datasets.head.arrays import JOINT_NAMES, RING_REGIONS
 from ....datasets.head.loaders import FLAME_IDENTITY_SIZE
 from ....datasets.head.teeth import lip_rings

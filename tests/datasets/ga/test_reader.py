@@ -11,7 +11,8 @@ import pytest
 from headbench.bench.contracts import Clip, FrameKey
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import find_captures, read_capture
-from headbench.datasets.ga.writer import CaptureWriter, identity_parameters, pose_to_parameters
+from headbench.datasets.ga.tracking import pose_to_parameters
+from headbench.datasets.ga.writer import CaptureWriter, identity_parameters
 from headbench.datasets.head.arrays import with_derived_regions
 from headbench.datasets.head.teeth import with_teeth
 from headbench.datasets.images import write_image

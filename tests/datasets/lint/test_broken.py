@@ -80,6 +80,11 @@ def test_damage_ends_with_findings(pristine, tmp_path, damage, data):
     outcome(capture)
 
 
+def test_a_path_that_no_file_can_have(good):
+    good.edit("transforms_train.json", lambda value: value["frames"][0].update(file_path="a\0b.png"))
+    assert "HB103" in outcome(good)
+
+
 def test_only_one_json_left(good):
     """No train JSON, no parameters, no head: the images of the rest are still looked at."""
     (good.union / "transforms_train.json").unlink()
