@@ -45,7 +45,7 @@ from ..named_protocol import check_capture, needed
 from ..protocol import Protocol, make_protocols
 from ..registry import discover, get, resolve
 from ..rows import Rows
-from ..specs import CommandResult, MethodSpec, MetricSpec
+from ..specs import CommandResult, MethodSpec, MetricSpec, command
 from .naming import Render, check_truth, composited, named_renders
 from .settings import EvaluateSettings
 
@@ -141,8 +141,9 @@ def images_method(label: str, version: str) -> ResolvedMethod:
     return ResolvedMethod(MethodSpec(label, "images of a folder", "", version=version), None, Budget())
 
 
+@command("evaluate", group="compare")
 def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress) -> CommandResult:
-    """Check everything, copy the images to the layout of a run, score them, write rows, manifest and reports.
+    """Score a folder of images or a stored avatar, without a plug-in.
 
     The text is the table, together with the run named by ``like``.
 

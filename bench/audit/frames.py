@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..io.files import check_output_folder, write_text
 from ..protocol import make_protocols
 from ..registry import get, resolve
-from ..specs import CommandResult, DatasetSpec
+from ..specs import CommandResult, DatasetSpec, command
 from .naming import MAP_COLUMNS, image_name
 from .settings import FramesSettings
 
@@ -28,8 +28,9 @@ COLUMNS = (
 )
 
 
+@command("frames", group="compare", writes="out")
 def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> CommandResult:
-    """Write `FRAMES_FILE` and `MAP_FILE` for the protocols of a run, or those of a run on a capture.
+    """List the frames that `evaluate` scores: file names, cameras, pose files.
 
     Raises `InputError` if the path is neither a run nor a capture, for options that require a capture, and
     for an edited `MAP_FILE`.

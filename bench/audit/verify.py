@@ -24,7 +24,7 @@ from ..manifest import ProtocolRecord
 from ..progress import counted
 from ..protocol import make_protocols
 from ..rows import ALL, FRAME, Rows
-from ..specs import CommandResult, MetricSpec
+from ..specs import CommandResult, MetricSpec, command
 from .evaluate import NoAvatar, images_method
 from .settings import VerifySettings
 
@@ -61,8 +61,9 @@ class Findings:
         return "\n".join([*lines, *([f"Not verified: {'; '.join(parts)}."] if parts else [])])
 
 
+@command("verify", group="validate")
 def verify_runs(settings: VerifySettings, progress: Progress = no_progress) -> CommandResult:
-    """Verify runs; not passed if anything differs.
+    """Score a run's stored frames again and report values that differ.
 
     A folder that is not a finished run, or a capture that cannot be opened, is a finding with exit code 3.
     """

@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..io.files import check_kind, output_inside, refuse_links
 from ..io.lock import locked
 from ..registry import get, resolve
-from ..specs import CommandResult
+from ..specs import CommandResult, command
 from .curve_settings import PICTURES, SECONDS, CurveSettings
 from .held_out import CAMERA, TIMESTEPS, count_of
 
@@ -30,8 +30,9 @@ COSTS = ("training_processor", "training_time", "training_memory")
 """Training costs that are measured as well."""
 
 
+@command("run curve", group="compare")
 def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> CommandResult:
-    """Plot quality against training time, cameras, timesteps, pictures or tracking error, measured on held-out training frames.
+    """Measure quality against training time, cameras, timesteps or tracking error.
 
     Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. A restart keeps finished
     trainings; an interrupted training starts over, since its time is measured.

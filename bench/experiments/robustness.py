@@ -18,15 +18,16 @@ from ..io.files import check_kind, output_inside, write_json
 from ..io.lock import locked
 from ..registry import get, resolve
 from ..rows import ALL, Rows
-from ..specs import CommandResult
+from ..specs import CommandResult, command
 from .robustness_settings import ExtremesSettings, ReenactSettings
 
 RECORD_FILE = "record.json"
 """File with settings, limits, protocols and results of each avatar."""
 
 
+@command("run extremes", group="compare")
 def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -> CommandResult:
-    """Render a run's avatars in views and poses beyond those of training; check them against truth and stability limits.
+    """Render views and poses beyond training; check against ground truth and stability limits.
 
     Does not pass if a limit is broken or an avatar failed. A restart keeps finished work. Raises `InputError`
     for a folder that is not a finished run, and for a capture that is not the run's.
@@ -34,8 +35,9 @@ def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -
     return _run(settings, "extremes", "extremes")
 
 
+@command("run reenact", group="compare")
 def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> CommandResult:
-    """Drive a run's avatars with another subject's expressions; check stability limits.
+    """Drive avatars with another subject's expressions; check stability limits.
 
     Does not pass if a limit is broken or an avatar failed. A restart keeps finished work. Raises `InputError`
     for a folder that is not a finished run, without another subject, and for a source tracked with another

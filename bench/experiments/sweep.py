@@ -17,12 +17,13 @@ from ..errors import InputError
 from ..io.files import check_kind, check_name, output_inside
 from ..io.lock import locked
 from ..registry import get, resolve
-from ..specs import CommandResult, MethodSpec
+from ..specs import CommandResult, MethodSpec, command
 from .sweep_settings import SweepSettings
 
 
+@command("run sweep", group="compare")
 def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> CommandResult:
-    """Derive smaller and faster variants of a run's avatars without training; quality against size and frame time.
+    """Derive smaller and faster avatars without training, and measure them.
 
     The trained avatars are measured again with their variants, so that frame times are comparable. Writes
     ``points.csv`` and ``pareto.png`` into the run folder. A restart keeps existing measurements and adds

@@ -13,7 +13,7 @@ from ...bench.io.files import write_json
 from ...bench.manifest import cut_of
 from ...bench.progress import counted
 from ...bench.protocol import evenly_with_ends
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from .settings import ImportTrackingSettings
 
 if TYPE_CHECKING:
@@ -25,8 +25,9 @@ SHOWN = 6
 """Timesteps of the picture."""
 
 
+@command("import tracking", group="data", writes="out", kinds=("captures",))
 def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_progress) -> CommandResult:
-    """Write a capture of the files of another tracker and the images that it tracked.
+    """Make a capture from the files of another tracker and the frames of the video.
 
     Writes under ``settings.out`` ``overlay.png`` with the mesh over a few images, the capture (PNG images without separate
     masks are linked, others are composited on white), and ``import.json``. Raises `InputError` for files that cannot be

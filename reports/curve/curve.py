@@ -23,7 +23,7 @@ from ...bench.experiments.tracking import tracking_error
 from ...bench.io.files import write_text
 from ...bench.manifest import ClipRecord, MethodRecord
 from ...bench.rows import ALL, Rows
-from ...bench.specs import CommandResult, MetricSpec
+from ...bench.specs import CommandResult, MetricSpec, command
 from ...bench.terminal import table
 from ..aggregate import subject_means
 from ..plots import MARKERS, SMALL, cost_axis, plot_file, show_missing, start_axes
@@ -178,8 +178,10 @@ def curve_report(out: Path, over: str) -> CommandResult:
     return joined_curve([RunData.read(out)], over, out)
 
 
+@command("report curve", group="inspect", writes="out")
 def curve_runs(settings: CurveReportSettings, progress: Progress = no_progress) -> CommandResult:
-    """Join runs of curves; see the settings and, for errors, `joined_curve`."""
+    """Join runs of `headbench run curve`: means over subjects, and the best method for each cost of a
+    training."""
     runs, out = [RunData.read(Path(run)) for run in settings.runs], Path(settings.out)
     return joined_curve(runs, settings.over, out)
 

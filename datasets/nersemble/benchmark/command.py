@@ -6,14 +6,15 @@ from pathlib import Path
 
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import ExitCode, UnavailableError
-from ....bench.specs import CommandResult
+from ....bench.specs import CommandResult, command
 from .settings import SubmissionCheckSettings, SubmissionWriteSettings
 
 SHOWN = 20
 
 
+@command("submission write", group="export")
 def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_progress) -> CommandResult:
-    """Write a submission to the NeRSemble benchmark and report the loss of its codec; exit code 3 without ffmpeg.
+    """Write a submission to the NeRSemble benchmark; exit code 3 without ffmpeg.
 
     Videos are H.264 of constant rate factor 14, YUV 4:2:0, as the benchmark's documentation says. The cost is measured on
     the encoded frames themselves.
@@ -50,8 +51,9 @@ def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_
     return CommandResult("\n".join(lines), data_out)
 
 
+@command("submission check", group="export")
 def submission_check(settings: SubmissionCheckSettings, progress: Progress = no_progress) -> CommandResult:
-    """Check a submission to the NeRSemble benchmark as its server does and decode every frame."""
+    """Check a submission to the NeRSemble benchmark as its server does."""
     from .submission import check_submission
 
     data = None if settings.data is None else Path(settings.data)

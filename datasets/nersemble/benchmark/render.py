@@ -15,7 +15,7 @@ from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE, open_avatar
 from ....bench.errors import InputError
 from ....bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_arrays
 from ....bench.io.images import quantise, write_png
-from ....bench.specs import CommandResult
+from ....bench.specs import CommandResult, command
 from ...head.arrays import HeadArrays, read_head
 from ...head.loaders import load_head
 from ...head.teeth import with_teeth_where_possible
@@ -112,8 +112,9 @@ log = logging.getLogger(__name__)
 WHITE = (1.0, 1.0, 1.0)
 
 
+@command("submission render", group="export", writes="out")
 def render_participant(settings: SubmissionRenderSettings, progress: Progress = no_progress) -> CommandResult:
-    """Render every frame of a participant's test sequences from all cameras of the track.
+    """Render the test frames of a NeRSemble benchmark participant.
 
     Raises `InputError` for an unknown participant, an avatar that cannot be read, and tracking or cameras that are missing or
     damaged, all before the first frame.
