@@ -76,6 +76,6 @@ def _call(words: list[str]) -> int:
         return ExitCode.OK
     if words[:1] == ["help"]:
         words = [*words[1:], "--help"]
-    from .commands import call  # imports the specs of all commands
+    from .commands import call
 
     return call(words)

@@ -1,5 +1,4 @@
-"""Specs of readers, synthetic captures, commands and benchmarks. Light to import: implementations are named, not
-loaded."""
+"""Specs of readers, synthetic captures and benchmarks. Light to import: implementations are named, not loaded."""
 
 from ..bench.specs import BenchmarkSpec, ConditionSpec, DatasetSpec
 

@@ -1,4 +1,4 @@
-"""Specs of reports and their commands, without heavy imports."""
+"""Specs of reports, without heavy imports."""
 
 from __future__ import annotations
 

@@ -25,8 +25,7 @@ from ..executors.settings import check_executor
 from ..io.files import write_text
 from ..registry import discover, get, resolve
 from ..specs import CommandResult, MethodSpec, command
-from .robustness import extremes_run
-from .robustness_settings import ExtremesSettings
+from .robustness import ExtremesSettings, extremes_run
 from .suite_settings import (
     ALL,
     AS_TRACKED,
