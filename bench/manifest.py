@@ -305,7 +305,10 @@ class Manifest:
             found = [*differences(*results)]
             for record in earlier.methods:
                 own = methods[record.label]
-                changed = differences({name: getattr(record, name) for name in own}, own)
+                then = {name: getattr(record, name) for name in own}
+                if own["config"] and then["config"]:  # the record also has paths on this machine
+                    then["config"] = {name: then["config"].get(name) for name in own["config"]}
+                changed = differences(then, own)
                 found += [(f"methods.{record.label}.{key}", old, new) for key, old, new in changed]
         if found:
             keys, before, wanted = ([each[place] for each in found[:3]] for place in range(3))
