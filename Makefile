@@ -8,7 +8,7 @@ JOBS   ?= 2
 # Build of PyTorch: cpu, cuda, or what pip's indexes offer of the two, the smaller first.
 TORCH  ?=
 
-.PHONY: help setup lock demo pictures docs test test-commands test-slow test-latest check nightly gpu gpu-checks gate baseline bench readme \
+.PHONY: help setup lock demo pictures docs test test-commands test-slow test-latest check nightly gpu gpu-checks gate baseline index bench readme \
   release-source dist wheels clean
 
 help:
@@ -27,6 +27,7 @@ help:
 	@echo "make gate    compare the numbers of a small demo with tests/demo_baseline.json"
 	@echo "make baseline  write that baseline again, after a change that is meant to move them"
 	@echo "make readme  store a new demo, and write its tables into README.md and docs/"
+	@echo "make index   write bench/commands.json, by which \`headbench --help\` lists commands without importing them"
 	@echo "make bench   measure the speed of the splat renderer"
 	@echo "make dist    sdist, and manylinux wheel for this machine, in dist/ (URL=the repository's public address)"
 	@echo "make wheels  manylinux wheels for x86-64 and aarch64, all Pythons; needs docker or podman"
@@ -117,6 +118,9 @@ bench: setup
 	$(BIN)/headbench doctor bench splats
 
 # Stores the rows of a demo, and writes its tables into the README and the documentation.
+index: setup
+	$(BIN)/python -c "from headbench.bench.registry import INDEX, index_text; INDEX.write_text(index_text())"
+
 readme: demo
 	$(BIN)/python docs/_ext/stored_results.py demo $(OUT) .
 

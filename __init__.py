@@ -62,7 +62,6 @@ if _TYPE_CHECKING:
     from .bench.specs import (
         BenchmarkSpec,
         CommandResult,
-        CommandSpec,
         ConditionSpec,
         DatasetSpec,
         Mechanism,
@@ -72,6 +71,7 @@ if _TYPE_CHECKING:
         ProfileSpec,
         ReportSpec,
         ResolutionRule,
+        command,
     )
     from .datasets.head.arrays import save_head
     from .datasets.head.loaders import load_head
@@ -95,7 +95,6 @@ __all__ = [
     "Clip",
     "CodedAvatar",
     "CommandResult",
-    "CommandSpec",
     "Condition",
     "ConditionSpec",
     "DatasetSpec",
@@ -143,6 +142,7 @@ __all__ = [
     "check_method",
     "check_metric",
     "check_reader",
+    "command",
     "evaluate",
     "exclude_given",
     "list_methods",
@@ -169,7 +169,7 @@ _HOMES = {
     "bench.engine.stored": ("load_avatar",),
     "bench.rows": ("ALL",),
     "bench.specs": tuple(name for name in __all__ if name.endswith("Spec"))
-    + ("CommandResult", "Mechanism", "Need", "ResolutionRule"),
+    + ("CommandResult", "Mechanism", "Need", "ResolutionRule", "command"),
     "datasets.head.arrays": ("save_head",),
     "datasets.head.loaders": ("load_head",),
     "datasets.steps.exclude": ("exclude_given",),

@@ -15,7 +15,7 @@ from .contracts import Progress
 from .errors import InputError
 from .io.files import check_writable, write_json
 from .registry import get, resolve
-from .specs import CommandResult
+from .specs import CommandResult, command
 
 Key = TypeVar("Key", bound=Hashable)
 Row = Mapping[str, Any]
@@ -90,13 +90,15 @@ class BenchSettings(StressSettings):
     """Measure speed and accuracy of approximate settings instead of only speed."""
 
 
+@command("doctor bench", group="validate")
 def bench(settings: BenchSettings, progress: Progress) -> CommandResult:
     """Benchmark a part of headbench itself on this machine."""
     return _measure(settings, "tradeoffs" if settings.tradeoffs else "speed", progress)
 
 
+@command("doctor stress", group="validate")
 def stress(settings: StressSettings, progress: Progress) -> CommandResult:
-    """Test a part of headbench at numerical extremes and print the result of each case."""
+    """Test a part of headbench at numerical extremes."""
     return _measure(settings, "stress", progress)
 
 

@@ -33,6 +33,8 @@ def main(arguments: list[str] | None = None) -> int:
             return ExitCode.OK  # `headbench --help | head -1`: not an error
         finally:
             show(end="")  # flush buffered output while errors can still be reported
+    except SystemExit as exited:  # of the parser: help, completion, wrong usage
+        return int(exited.code or ExitCode.OK)
     except HeadbenchError as error:
         return _fail(str(error), ExitCode.BAD_INPUT)
     except KeyboardInterrupt as error:
@@ -74,6 +76,6 @@ def _call(words: list[str]) -> int:
         return ExitCode.OK
     if words[:1] == ["help"]:
         words = [*words[1:], "--help"]
-    from .commands import call  # imports the specs of all commands
+    from .commands import call
 
     return call(words)

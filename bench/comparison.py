@@ -46,7 +46,7 @@ from .named_protocol import check_capture, needed
 from .progress import counted, log_to_file
 from .progress import progress as show_progress
 from .registry import get, resolve
-from .specs import CommandResult
+from .specs import CommandResult, command
 
 if TYPE_CHECKING:
     from .engine.store import FinishedRun
@@ -87,8 +87,9 @@ ONE_SUBJECT = (
 )
 
 
+@command("demo", group="compare")
 def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
-    """Run a complete comparison on a synthetic capture: render it, train, measure, print the table.
+    """Compare all methods on a synthetic capture; needs no data, GPU or network.
 
     With the preset "quick", avatars are trained beside each other, with one thread each: a training keeps about 1.2 of 2 cores busy.
     """
@@ -183,6 +184,7 @@ class RunSettings:
         return presets_of_methods()
 
 
+@command("run", group="compare")
 def run(settings: RunSettings, progress: Progress) -> CommandResult:
     """Train methods on a capture, render, measure, and write tables and pictures."""
     values: dict[str, Any] = read_yaml(Path(settings.config)) if settings.config else {}

@@ -10,7 +10,7 @@ import tyro
 
 from .contracts import Progress
 from .errors import ExitCode, HeadbenchError, install_extra
-from .specs import CommandResult, MethodSpec, Need
+from .specs import CommandResult, MethodSpec, Need, command
 
 State = Literal["ready", "partly", "missing"]
 
@@ -55,8 +55,9 @@ class PluginStatus(NamedTuple):
         return "partly" if self.missing else "ready"
 
 
+@command("doctor", group="validate")
 def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
-    """Report for every method, metric and reader what is missing on this machine, and how to install it.
+    """Report what methods, metrics and readers lack here, and how to install it.
 
     Raises `InputError` for unknown methods and settings, also of programs, and for an invalid device.
     """

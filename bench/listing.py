@@ -11,7 +11,7 @@ import tyro
 from .contracts import Progress
 from .named_protocol import named_protocols
 from .registry import Group, discover, get, resolve
-from .specs import CommandResult
+from .specs import CommandResult, command
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,9 @@ class ListSettings:
             raise ValueError(f"--cite is for methods; found {self.what}")
 
 
+@command("list", group="inspect")
 def list_installed(settings: ListSettings, progress: Progress) -> CommandResult:
-    """List what is installed: methods, presets, metrics, their profiles, readers, reports, benchmarks, commands, papers, protocols."""
+    """List installed methods, presets, metrics, readers, reports and commands."""
     if settings.what == "papers" or settings.cite:
         return _shown(resolve(get("reports", "citations" if settings.cite else "papers").implementation)())
     if settings.what == "protocols":

@@ -3,12 +3,11 @@
 # Without `from __future__ import annotations`, since the parser reads annotations created when a command is called.
 
 import inspect
-import io
 import json as json_module
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, redirect_stderr, suppress
+from contextlib import nullcontext, suppress
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
@@ -29,8 +28,6 @@ from .terminal import wrapped
 
 Command = Callable[..., Callable[[], int]]
 """Takes settings and returns a function that runs the command, which separates parsing errors from errors of the command."""
-RULE = re.compile(r"[ ─╰╯+-]*")
-"""A horizontal line of the parser's box, in Unicode or ASCII."""
 
 
 def call_command(name: str, plugins: Mapping[str, Plugin], words: Sequence[str]) -> int:
@@ -61,34 +58,11 @@ def with_home(word: str) -> str:
 
 
 def _parse(command: Any, program: str, words: Sequence[str]) -> Any:
-    """Parse arguments; return the result of ``command``.
-
-    Raises `HeadbenchError` with the parser's message as one line, without the box that it prints.
-    """
+    """Parse arguments; return the result of ``command``. Exits with code 2 after printing what is wrong with them."""
     config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
-    printed = io.StringIO()
-    terminal = (
-        "dumb" if os.environ.get("NO_COLOR") else None
-    )  # the parser knows such terminals, but not the variable
-    try:
-        with redirect_stderr(printed), environment_variable("TERM", terminal):
-            return tyro.cli(command, prog=program, args=words, config=config, registry=_values())
-    except SystemExit as ended:
-        if not ended.code:
-            raise
-        box = re.sub(r"\x1b\[[\d;]*m", "", printed.getvalue()).splitlines()[1:]  # without its title
-        lines = (line.strip(" │|") for line in box)
-        text = "\n".join("" if RULE.fullmatch(line) else line for line in lines)
-        parts = re.split(r"\n\n+", text.strip())
-        parts = [
-            " ".join(part.split()).rstrip(".") for part in parts if not part.startswith("For full helptext")
-        ]
-        message = ". ".join(parts)
-        settings = get_args(getattr(command, "__annotations__", {}).get("settings"))
-        unknown = "Unrecognized options" in message and "Perhaps you meant" not in message
-        if unknown and settings and hasattr(settings[0], "set"):
-            message += ". A setting that has no option is given with --set, such as `--set device=cuda`"
-        raise HeadbenchError(f"command line: {message}. `{program} --help` lists the options.") from None
+    # The parser knows dumb terminals, but not the variable.
+    with environment_variable("TERM", "dumb" if os.environ.get("NO_COLOR") else None):
+        return tyro.cli(command, prog=program, args=words, config=config, registry=_values())
 
 
 def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
@@ -113,7 +87,9 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
             check_kind(Path(folder), *spec.kinds)
         lock = locked(Path(folder)) if folder else nullcontext()
         with log_to_terminal(), lock, progress(name) as report:
-            findings = resolve(spec.function)(settings, report)
+            function = resolve(spec.function)
+            arguments = vars(settings) if hasattr(function, "options") else {"settings": settings}
+            findings = function(**arguments, progress=report)
         if json:
             show(json_module.dumps(findings.data, indent=1, default=to_jsonable))
         else:

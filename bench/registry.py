@@ -1,17 +1,18 @@
 """Finds methods, readers, metrics and reports by entry points; imports an implementation when it is used.
 
 The command line does not import these packages: an entry point names a light spec, and the spec names its
-implementation as ``"package.module:attribute"``.
+implementation as ``"package.module:attribute"``. That of a command names its function; `INDEX` has the specs of our own.
 """
 
 from __future__ import annotations
 
 import difflib
 import importlib
+import json
 import logging
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from importlib import metadata
 from importlib.metadata import Distribution, EntryPoint
@@ -45,6 +46,8 @@ SPEC_TYPES: dict[str, type] = {
 }
 log = logging.getLogger(__name__)
 _OWN = "headbench"
+INDEX = Path(__file__).with_name("commands.json")
+"""Specs of headbench's commands, so that a list of them imports none of their modules; ``make index`` writes it."""
 
 
 @dataclass(frozen=True)
@@ -161,14 +164,29 @@ def _load(entry: EntryPoint, group: str) -> Plugin:
     version = f" {_name_and_version(entry.dist)[1]}" if entry.dist is not None else ""
     origin = f"{_origin(entry)}{version}"
     try:
-        return Plugin(entry.name, origin, _checked(entry.load(), group, entry.name))
+        own = _index().get(entry.value) if group == "commands" else None
+        return Plugin(entry.name, origin, own or _checked(entry.load(), group, entry.name))
     except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way; the others must still load
         return Plugin(entry.name, origin, None, f"{type(error).__name__}: {error}")
 
 
-def _checked(spec: Any, group: str, name: str) -> Any:
+@lru_cache
+def _index() -> dict[str, CommandSpec]:
+    """The commands of `INDEX` by function."""
+    specs = (CommandSpec(**{**each, "kinds": tuple(each["kinds"])}) for each in json.loads(INDEX.read_text()))
+    return {spec.function: spec for spec in specs}
+
+
+def index_text() -> str:
+    """What `INDEX` should contain: the specs of the functions that headbench's entry points name."""
+    own = [entry for entry in entry_points("headbench.commands") if _origin(entry) == _OWN]
+    specs = [asdict(entry.load().spec) for entry in sorted(own, key=lambda entry: entry.name)]
+    return "[\n" + ",\n".join(map(json.dumps, specs)) + "\n]\n"
+
+
+def _checked(value: Any, group: str, name: str) -> Any:
+    spec = getattr(value, "spec", value) if group == "commands" else value
     if not isinstance(spec, SPEC_TYPES[group]):
-        raise InputError(
-            f"registry of {group}", name, f"a {SPEC_TYPES[group].__name__}", f"a {type(spec).__name__}"
-        )
+        expected = "a function with @command" if group == "commands" else f"a {SPEC_TYPES[group].__name__}"
+        raise InputError(f"registry of {group}", name, expected, f"a {type(spec).__name__}")
     return spec

@@ -6,9 +6,10 @@ resolved when it is used. The behaviours are defined in `contracts`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, make_dataclass, replace
+from typing import Any, Literal, NamedTuple, TypeVar, get_type_hints
 
 MAX_LABEL = 120
 LABEL = f"at most {MAX_LABEL} printable characters"
@@ -434,31 +435,7 @@ class BenchmarkSpec:
 
 @dataclass(frozen=True)
 class CommandSpec:
-    """A command of the command line. Listing it imports neither its settings nor its function.
-
-    Attributes
-    ----------
-    name : str
-        One word, or two of which the first names a group of commands ("prepare nersemble").
-    group : str
-        Heading of ``headbench --help`` that lists it: one of `COMMAND_GROUPS`, or another, shown after them.
-    summary : str
-        One sentence.
-    settings : str
-        "package.module:Class" of a frozen dataclass. Its attributes become options, and the strings below them
-        their help; ``--help`` of the command imports this module. A static method ``notes() -> str``
-        returns additional help text.
-    function : str
-        "package.module:function" of ``(settings, progress: Progress) -> CommandResult``. The exit code is that of the
-        result if it has one, otherwise 0 if it passed and 1 if it did not.
-    writes : str
-        Setting with the output folder, which other processes cannot use while the command runs; "" for none.
-    kinds : tuple of str
-        Kinds of folder in which the command may continue, see `bench.io.files.check_kind`.
-    programs : mapping of str to str
-        Programs of other authors that the command runs, by name: "package.module:function" of ``(settings, device) -> Iterator[Need]``,
-        where ``settings`` is the mapping that ``headbench doctor --set settings.NAME.KEY=VALUE`` gives.
-    """
+    """What `command` says about a command of the command line; ``settings`` and ``function`` are "package.module:name"."""
 
     name: str
     group: str
@@ -468,6 +445,65 @@ class CommandSpec:
     writes: str = ""
     kinds: tuple[str, ...] = ()
     programs: Mapping[str, str] = field(default_factory=dict)
+
+
+_Function = TypeVar("_Function", bound=Callable[..., CommandResult])
+
+
+def command(
+    name: str,
+    *,
+    group: str,
+    writes: str = "",
+    kinds: tuple[str, ...] = (),
+    programs: Mapping[str, str] | None = None,
+) -> Callable[[_Function], _Function]:
+    """Make a function with a parameter ``progress: Progress``, which returns a `CommandResult`, a command of the command line.
+
+    Its summary is the first paragraph of the docstring. Its other parameters become options, and their section in the docstring
+    the help. A parameter ``settings`` instead has a frozen dataclass as its type, which can check its values and be shared:
+    its attributes become options, and the strings below them their help; a static method ``notes() -> str`` returns more help.
+    The exit code is that of the result if it has one, otherwise 0 if it passed and 1 if it did not.
+
+    Parameters
+    ----------
+    name : str
+        One word, or two of which the first names a group of commands ("prepare nersemble"); also of the entry point.
+    group : str
+        Heading of ``headbench --help`` that lists it: one of `COMMAND_GROUPS`, or another, shown after them.
+    writes : str
+        Setting with the output folder, which other processes cannot use while the command runs; "" for none.
+    kinds : tuple of str
+        Kinds of folder in which the command may continue, see `bench.io.files.check_kind`.
+    programs : mapping of str to str
+        Programs of other authors that the command runs, by name: "package.module:function" of ``(settings, device) -> Iterator[Need]``,
+        where ``settings`` is the mapping that ``headbench doctor --set settings.NAME.KEY=VALUE`` gives.
+    """
+
+    def describe(function: _Function) -> _Function:
+        reference, text = f"{function.__module__}:{function.__qualname__}", inspect.getdoc(function) or ""
+        summary = " ".join(text.partition("\n\n")[0].split())
+        settings = get_type_hints(function).get("settings")
+        if settings is None:
+            function.options = _options(function)  # type: ignore[attr-defined]
+            options = f"{reference}.options"
+        else:
+            options = f"{settings.__module__}:{settings.__qualname__}"
+        function.spec = CommandSpec(name, group, summary, options, reference, writes, kinds, programs or {})  # type: ignore[attr-defined]
+        return function
+
+    return describe
+
+
+def _options(function: Callable[..., CommandResult]) -> type:
+    """A dataclass of the parameters of a command except ``progress``, with their descriptions as its docstring."""
+    hints, members = get_type_hints(function, include_extras=True), []
+    for name, parameter in inspect.signature(function).parameters.items():
+        default = {} if parameter.default is parameter.empty else {"default": parameter.default}
+        if name != "progress":
+            members.append((name, hints[name], field(**default)))
+    doc = (inspect.getdoc(function) or "").partition("\n\n")[2]
+    return make_dataclass("Options", members, namespace={"__doc__": doc}, frozen=True)
 
 
 COMMAND_GROUPS = ("compare", "inspect", "data", "export", "validate")

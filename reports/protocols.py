@@ -16,7 +16,7 @@ from ..bench.io.files import check_writable, write_text
 from ..bench.named_protocol import NamedProtocol, TaskFrames, named_protocols, protocol_named
 from ..bench.protocol import TASK_TITLES
 from ..bench.registry import get
-from ..bench.specs import CommandResult, MetricSpec
+from ..bench.specs import CommandResult, MetricSpec, command
 from ..bench.terminal import table
 from .aggregate import summarise
 from .cameras import unseen_cameras
@@ -178,8 +178,9 @@ def choices(runs: RunSet) -> dict[str, NamedProtocol]:
     return found | {f"{NAMED}{name}": protocol for name, protocol in named_protocols().items()}
 
 
+@command("protocols", group="compare")
 def protocols_command(settings: ProtocolsSettings, progress: Progress) -> CommandResult:
-    """Tabulate the effect of each choice of a protocol in dB and LPIPS, for every method of runs.
+    """Show how each choice of an evaluation changes the results: pixels, metrics, cameras, means.
 
     Raises `InputError` for runs that cannot be combined, and for unknown methods.
     """

@@ -14,7 +14,7 @@ from ..bench.io.files import (
     check_writable,
     write_text,
 )
-from ..bench.specs import CommandResult
+from ..bench.specs import CommandResult, command
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ SUFFIXES = {".md": "md", ".txt": "text", ".tex": "latex", ".html": "html", ".csv
 """Formats of tables by the suffix of a file."""
 
 
+@command("table", group="compare")
 def print_table(settings: TableSettings, progress: Progress) -> CommandResult:
     """Print a table of finished runs on the same frames, or write it to a file."""
     from .table_report import tables_of, written

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
+import tyro
 
 from ..condition import PLAIN
 from ..contracts import (
@@ -23,6 +24,7 @@ from ..contracts import (
     FrameKey,
     HeadPose,
     Progress,
+    TaskName,
     no_progress,
 )
 from ..engine.captures import capture_configuration, open_clips, open_run_clips
@@ -33,6 +35,7 @@ from ..engine.run import run
 from ..engine.store import Cell
 from ..engine.stored import avatar_digest, open_avatar
 from ..errors import HeadbenchError, InputError
+from ..executors.options import ExecutionOptions
 from ..executors.remote import run_as_task
 from ..io.files import (
     atomic_path,
@@ -42,12 +45,90 @@ from ..io.files import (
 )
 from ..io.images import probe_image, read_pixels, read_png, write_png
 from ..named_protocol import check_capture, needed
+from ..options import DependentOptions
 from ..protocol import Protocol, make_protocols
 from ..registry import discover, get, resolve
 from ..rows import Rows
-from ..specs import CommandResult, MethodSpec, MetricSpec
+from ..specs import CommandResult, MethodSpec, MetricSpec, command
 from .naming import Render, check_truth, composited, named_renders
-from .settings import EvaluateSettings
+
+
+@dataclass(frozen=True)
+class EvaluateSettings(ExecutionOptions):
+    """Score a folder of images, made without a plug-in, or a stored avatar.
+
+    An image is SEQUENCE_TIMESTEP_CAMERA.png (timestep of five digits), as `headbench run` names its renders: 8-bit RGB PNG of
+    the ground truth's size, composited on the capture's background. It lies in FOLDER itself, in a folder named after the task,
+    or in renders/TASK; with several subjects, in a folder named after the subject. A cell of a run (SUBJECT/METHOD/seed-N) also
+    has this layout. Give other names with --names.
+    """
+
+    folder: tyro.conf.Positional[str]
+    """Folder with the images, or with --avatar that of an avatar as `headbench render` takes it."""
+
+    out: str
+    """Folder to write: a run with one method, which `table`, `compare`, `verify` and every report can read."""
+
+    clip: str | None = None
+    """Capture to score against (or folder of several); default: that of the run named by --like."""
+
+    label: str = ""
+    """Name of the method in tables; not the name of a registered method. Default: images, with --avatar the method that
+    avatar.json names."""
+
+    avatar: bool = False
+    """FOLDER holds an avatar: it is rendered, and its storage and speed are measured, too."""
+
+    method: str = ""
+    """With --avatar: its method as package.module:SPEC, where that is not registered."""
+
+    device: str = "cpu"
+    """Device of metrics that can use a GPU, and of rendering with --avatar."""
+
+    names: str = ""
+    """How the images are named, if not by key: a method whose own program numbers its renders, such as an adapter to an
+    official repository, or a file MAP.csv with the columns file, sequence, timestep, camera (and subject with several)."""
+
+    any_background: bool = False
+    """Score images as they are even where their background is not the capture's, which is refused otherwise."""
+
+    like: str | None = None
+    """Run whose protocols to follow: capture, reader and its settings, tasks, frames, metrics are taken from it."""
+
+    tasks: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
+    """Tasks to score. Not with --like, whose run decides it."""
+
+    metrics: tuple[str, ...] = ()
+    """Metrics of frames to compute; default: those of `headbench run`. Not with --like."""
+
+    protocol: tuple[str, ...] = ()
+    """Published protocols, as for `headbench run`. Not with --like."""
+
+    reader: str = ""
+    """Which dataset reader opens the capture; default: the one that finds it. Not with --like."""
+
+    head: str | None = None
+    """Head model of captures that do not contain one: FLAME pickle or npz."""
+
+    trust: bool = False
+    """With --like, import the modules that the run folder names for metrics and readers which are not registered; they
+    can run any code."""
+
+    frames_per_task: int | None = None
+    """Largest number of frames scored per subject and task, evenly spaced; default: all. Not with --like."""
+
+    dependent = (
+        DependentOptions(("tasks", "metrics", "protocol", "reader", "frames_per_task"), "like", False),
+        DependentOptions(("trust",), "like"),
+        DependentOptions(("method",), "avatar"),
+        DependentOptions(("names", "any_background"), "avatar", False),
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse settings without a reference for the evaluation."""
+        if self.clip is None and self.like is None:
+            raise ValueError("state the reference: --clip CAPTURE or --like RUN")
+
 
 SAMPLE = 8
 """Number of frames checked per subject and task, evenly spaced."""
@@ -141,8 +222,9 @@ def images_method(label: str, version: str) -> ResolvedMethod:
     return ResolvedMethod(MethodSpec(label, "images of a folder", "", version=version), None, Budget())
 
 
+@command("evaluate", group="compare")
 def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress) -> CommandResult:
-    """Check everything, copy the images to the layout of a run, score them, write rows, manifest and reports.
+    """Score a folder of images or a stored avatar, without a plug-in.
 
     The text is the table, together with the run named by ``like``.
 

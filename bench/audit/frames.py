@@ -5,19 +5,49 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from ..contracts import Clip, FrameKey, Progress, no_progress
+import tyro
+
+from ..contracts import Clip, FrameKey, Progress, TaskName, no_progress
 from ..engine.captures import capture_configuration, found_captures, open_clips, open_run_clips
-from ..engine.config import RunConfig
+from ..engine.config import RunConfig, RunOptions
 from ..engine.store import RunFolder
 from ..errors import InputError
 from ..io.files import check_output_folder, write_text
 from ..protocol import make_protocols
 from ..registry import get, resolve
-from ..specs import CommandResult, DatasetSpec
+from ..specs import CommandResult, DatasetSpec, command
 from .naming import MAP_COLUMNS, image_name
-from .settings import FramesSettings
+
+
+@dataclass(frozen=True)
+class FramesSettings(RunOptions):
+    """List the frames that `headbench evaluate` scores, for renders that are made outside of headbench.
+
+    Writes OUT/frames.csv, one row for each frame: task, key (subject, sequence, timestep, camera), the file name that
+    `headbench evaluate` expects in a folder of images, size, background, intrinsics in pixels (the centre of the top left pixel
+    is at 0.5, 0.5), the first three rows of the 4 x 4 world-to-camera matrix (OpenCV axes, metres), and the file with the
+    tracking parameters of the timestep, where the capture has one. OUT/MAP.csv has the same frames in the format of `headbench
+    evaluate --names`: replace the names in its column file by those of your renders.
+    """
+
+    source: tyro.conf.Positional[str]
+    """Folder of a run, whose protocols are followed, or a capture (or folder of several)."""
+
+    out: str
+    """Folder to write."""
+
+    tasks: tuple[TaskName, ...] = ()
+    """Tasks to list for a capture; default: those of `headbench run`."""
+
+    frames_per_task: int | None = None
+    """For a capture: maximum number of frames per subject and task, evenly spaced, as in `headbench run`."""
+
+    reader: str = ""
+    """Which dataset reader opens the capture; default: the one that finds it."""
+
 
 FRAMES_FILE, MAP_FILE = "frames.csv", "MAP.csv"
 COLUMNS = (
@@ -28,8 +58,9 @@ COLUMNS = (
 )
 
 
+@command("frames", group="compare", writes="out")
 def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> CommandResult:
-    """Write `FRAMES_FILE` and `MAP_FILE` for the protocols of a run, or those of a run on a capture.
+    """List the frames that `evaluate` scores: file names, cameras, pose files.
 
     Raises `InputError` if the path is neither a run nor a capture, for options that require a capture, and
     for an edited `MAP_FILE`.

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import tyro
 
 from ..condition import Condition, Named
 from ..contracts import Progress, no_progress
 from ..engine.captures import open_run_clips
 from ..engine.cell import measure, render
-from ..engine.config import CODED_VARIANT, resolve_cells, resolve_metrics
+from ..engine.config import CODED_VARIANT, RunOptions, resolve_cells, resolve_metrics
 from ..engine.plan import Job, make_jobs
 from ..engine.store import Cell, RunFolder
 from ..errors import ExitCode, InputError
@@ -24,9 +25,30 @@ from ..manifest import ProtocolRecord
 from ..progress import counted
 from ..protocol import make_protocols
 from ..rows import ALL, FRAME, Rows
-from ..specs import CommandResult, MetricSpec
+from ..specs import CommandResult, MetricSpec, command
 from .evaluate import NoAvatar, images_method
-from .settings import VerifySettings
+
+
+@dataclass(frozen=True)
+class VerifySettings(RunOptions):
+    """Score the stored frames of runs again and compare the values with those of the runs.
+
+    Captures, protocols, frames and avatars are compared with the run's record, too. The last line of a run names what was not
+    verified. Exit code 0: everything that was verified is as recorded; 1: something differs; 2: wrong usage; 3: a run or its
+    capture is missing or invalid.
+    """
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of finished runs, or of `headbench evaluate`."""
+
+    render: bool = False
+    """Also render the stored avatars again and compare the frames, which may differ by one level of 8 bits."""
+
+    def __post_init__(self) -> None:
+        """Refuse to verify nothing."""
+        if not self.runs:
+            raise InputError("command line", "RUNS", "a run", "none")
+
 
 KEY = ["method", "condition", "seed", "task", *FRAME, "region", "metric"]
 SHOWN = 20
@@ -61,8 +83,9 @@ class Findings:
         return "\n".join([*lines, *([f"Not verified: {'; '.join(parts)}."] if parts else [])])
 
 
+@command("verify", group="validate")
 def verify_runs(settings: VerifySettings, progress: Progress = no_progress) -> CommandResult:
-    """Verify runs; not passed if anything differs.
+    """Score a run's stored frames again and report values that differ.
 
     A folder that is not a finished run, or a capture that cannot be opened, is a finding with exit code 3.
     """

@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..machine import check_device
 from ..options import DependentOptions
 from ..registry import SPEC_TYPES, Group, discover, get, resolve
-from ..specs import CommandResult, DatasetSpec, MethodSpec, MetricSpec
+from ..specs import CommandResult, DatasetSpec, MethodSpec, MetricSpec, command
 from .methods import attempt, check_method
 from .metrics import check_metric
 
@@ -57,8 +57,9 @@ KINDS: dict[Group, str] = {"methods": "method", "datasets": "reader", "metrics":
 TIMESTEPS = 4  # of the generated capture
 
 
+@command("doctor check", group="validate")
 def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress) -> CommandResult:
-    """Check a method, reader or metric against its contract and list every violation; exit code 1 if there are any.
+    """Check a method, reader or metric against its contract.
 
     Raises `InputError` for wrong usage, and `HeadbenchError` where the plug-in cannot be imported.
     """

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
 from ..contracts import Progress
-from ..specs import CommandResult
+from ..specs import CommandResult, command
 
 
-@dataclass(frozen=True)
-class StatusSettings:
-    """Shows the progress of a run, or of a finished run. Exit code 1: a cell failed."""
+@command("status", group="compare")
+def status(run: tyro.conf.Positional[str], progress: Progress) -> CommandResult:
+    """Show which cells of a run are waiting, running, done or failed.
 
-    run: tyro.conf.Positional[str]
-    """Folder of the run."""
+    Shows the progress of a run, or of a finished run. Exit code 1: a cell failed.
 
-
-def status(settings: StatusSettings, progress: Progress) -> CommandResult:
-    """Show which cells of a run are waiting, running, done or failed, and the time left."""
+    Parameters
+    ----------
+    run : str
+        Folder of the run.
+    """
     from .status import run_status
 
-    return run_status(Path(settings.run))
+    return run_status(Path(run))

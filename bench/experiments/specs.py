@@ -1,49 +1,8 @@
-"""The experiments and the conditions that they register; light to import."""
+"""Conditions that the experiments register; light to import."""
 
 from __future__ import annotations
 
-from ..specs import CommandSpec, ConditionSpec, MetricSpec
-
-SUITE = CommandSpec(
-    name="run suite",
-    group="compare",
-    summary="Run the benchmark suite: ten synthetic subjects, all methods; takes hours.",
-    settings="headbench.bench.experiments.suite_settings:SuiteSettings",
-    function="headbench.bench.experiments.suite:suite",
-    writes="out",
-)
-
-SWEEP = CommandSpec(
-    name="run sweep",
-    group="compare",
-    summary="Derive smaller and faster avatars without training, and measure them.",
-    settings="headbench.bench.experiments.sweep_settings:SweepSettings",
-    function="headbench.bench.experiments.sweep:sweep_run",
-)
-
-CURVE = CommandSpec(
-    name="run curve",
-    group="compare",
-    summary="Measure quality against training time, cameras, timesteps or tracking error.",
-    settings="headbench.bench.experiments.curve_settings:CurveSettings",
-    function="headbench.bench.experiments.curve:curve_run",
-)
-
-EXTREMES_COMMAND = CommandSpec(
-    name="run extremes",
-    group="compare",
-    summary="Render views and poses beyond training; check against ground truth and stability limits.",
-    settings="headbench.bench.experiments.robustness_settings:ExtremesSettings",
-    function="headbench.bench.experiments.robustness:extremes_run",
-)
-
-REENACT_COMMAND = CommandSpec(
-    name="run reenact",
-    group="compare",
-    summary="Drive avatars with another subject's expressions; check stability limits.",
-    settings="headbench.bench.experiments.robustness_settings:ReenactSettings",
-    function="headbench.bench.experiments.robustness:reenact_run",
-)
+from ..specs import ConditionSpec, MetricSpec
 
 HOLD_OUT = ConditionSpec(
     name="hold-out",

@@ -24,9 +24,8 @@ from ..errors import InputError
 from ..executors.settings import check_executor
 from ..io.files import write_text
 from ..registry import discover, get, resolve
-from ..specs import CommandResult, MethodSpec
-from .robustness import extremes_run
-from .robustness_settings import ExtremesSettings
+from ..specs import CommandResult, MethodSpec, command
+from .robustness import ExtremesSettings, extremes_run
 from .suite_settings import (
     ALL,
     AS_TRACKED,
@@ -47,8 +46,9 @@ REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
 """Regions of the frame with separate tables."""
 
 
+@command("run suite", group="compare", writes="out")
 def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandResult:
-    """Run the benchmark suite: ten synthetic subjects, all methods, tables by region and part.
+    """Run the benchmark suite: ten synthetic subjects, all methods; takes hours.
 
     Every subject has its own run, with conditions. Subjects run one after another, and the tables of ``results.md`` are written
     after each. Images of twice the size have separate captures and runs, since means over subjects need equal sizes.

@@ -3,26 +3,62 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import tyro
 
 from ..condition import PLAIN, Condition, Named
 from ..contracts import Avatar, Clip, Progress, no_progress
-from ..engine.config import default_names, with_methods
+from ..engine.config import RunOptions, default_names, with_methods
 from ..engine.guard import TrainingView
 from ..engine.plan import trained
 from ..engine.run import run
 from ..engine.store import RunFolder
 from ..errors import InputError
+from ..executors.options import ExecutionOptions
 from ..io.files import check_kind, check_name, output_inside
 from ..io.lock import locked
 from ..registry import get, resolve
-from ..specs import CommandResult, MethodSpec
-from .sweep_settings import SweepSettings
+from ..specs import CommandResult, MethodSpec, command
 
 
+@dataclass(frozen=True)
+class SweepSettings(RunOptions, ExecutionOptions):
+    """Quality against size and frame time of variants derived from a run's avatars without training."""
+
+    run: tyro.conf.Positional[str]
+    """Folder of a finished run."""
+
+    out: str | None = None
+    """Folder to write, a run folder itself; default: `sweep` in the folder of the run. The same sweep in it is continued."""
+
+    methods: tuple[str, ...] = ()
+    """Methods to derive from; default: all that provide variants."""
+
+    variants: tuple[str, ...] = ()
+    """Variants to derive, by name; default: all. The trained avatar itself is always measured."""
+
+    frames: int | None = None
+    """Maximum number of scored frames per subject and task, evenly spaced; default: that of the run."""
+
+    task: str = "novel_view"
+    """Task whose frames give the quality in the plot."""
+
+    metric: str = ""
+    """Metric of quality in the plot; default: the first of frames that the run has."""
+
+    time: str = ""
+    """Metric of frame time in the plot, in ms: latency_p50 (default), processor_time on a machine with other work."""
+
+    def __post_init__(self) -> None:
+        if self.frames is not None and self.frames < 1:
+            raise ValueError(f"frames is {self.frames}; at least 1")
+
+
+@command("run sweep", group="compare")
 def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> CommandResult:
-    """Derive smaller and faster variants of a run's avatars without training; quality against size and frame time.
+    """Derive smaller and faster avatars without training, and measure them.
 
     The trained avatars are measured again with their variants, so that frame times are comparable. Writes
     ``points.csv`` and ``pareto.png`` into the run folder. A restart keeps existing measurements and adds

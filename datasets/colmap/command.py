@@ -13,7 +13,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import write_json
 from ...bench.io.lock import LOCK_FILE
 from ...bench.options import DependentOptions
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from ..options import CaptureOptions
 
 
@@ -51,8 +51,9 @@ MARKER = "headbench-export.json"
 """File that identifies a folder written by `export_colmap`; others may have the user's own model and images."""
 
 
+@command("export colmap", group="export", writes="out", kinds=("a COLMAP dataset",))
 def export_colmap(settings: ExportColmapSettings, progress: Progress) -> CommandResult:
-    """Write frames of a capture as a COLMAP dataset: images, masks and a sparse model.
+    """Write frames of a capture as a COLMAP dataset: images, masks, sparse model.
 
     See `export_model`. Raises `InputError` for timesteps that the capture lacks.
     """

@@ -33,7 +33,7 @@ from ...bench.io.images import quantise, write_png
 from ...bench.io.lock import locked
 from ...bench.io.provenance import RENDER
 from ...bench.io.video import ENCODINGS, browser_encoder, write_browser_video
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from ..clip import CaptureClip, FrameFiles, without_images
 from ..ga.writer import CANONICAL_JAW, CapturePlan, CaptureWriter, SequencePlan
 from ..head.arrays import JOINT_NAMES, HeadArrays, read_head
@@ -280,8 +280,9 @@ def _lips(head: HeadArrays, neutral: FloatArray) -> tuple[IntArray, IntArray] | 
 RESULT_FILE = "drive.json"
 
 
+@command("drive", group="inspect")
 def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> CommandResult:
-    """Drive a stored avatar; see the settings.
+    """Drive a stored avatar with any signal: coefficients, blendshapes, FLAME parameters, a capture.
 
     Raises `InputError` before any rendering for an avatar, a signal, a map or a capture that cannot be read or do not fit.
     """

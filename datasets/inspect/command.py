@@ -13,7 +13,7 @@ import tyro
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import write_json
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from ...bench.terminal import table
 from ..options import CaptureOptions
 
@@ -42,8 +42,9 @@ class InspectSettings(CaptureOptions):
 PICTURE, NUMBERS = "inspection.png", "inspection.json"
 
 
+@command("inspect", group="inspect", writes="out")
 def inspect(settings: InspectSettings, progress: Progress = no_progress) -> CommandResult:
-    """Plot the contents of a capture: camera rig, splits, tracked mesh over images, motion by sequence.
+    """Plot a capture: camera rig, splits, tracked mesh over images, motion.
 
     Raises `InputError` for a capture that the reader refuses (``headbench lint`` reports all faults),
     for a clip without training frames that are not excluded, and for counts below 1.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.progress import counted
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from .rules import SEVERITIES, Finding, apply
 from .settings import LintSettings
 
@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from .evidence import Evidence
 
 
+@command("lint", group="data")
 def lint(settings: LintSettings, progress: Progress = no_progress) -> CommandResult:
-    """Check a capture for faults that make a comparison unfair or wrong; --list explains the codes.
+    """Check a capture for faults that make a comparison unfair or wrong.
 
     Passes if there are no errors; with ``strict``, also no warnings.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from .names import SUBJECT_NAMES, chosen_subjects
 from .settings import PrepareSettings
 
@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from .prepare import SubjectResult
 
 
+@command("prepare nersemble", group="data")
 def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progress) -> CommandResult:
-    """Convert raw NeRSemble recordings to captures; an interrupted conversion is continued.
+    """Convert raw NeRSemble recordings to captures.
 
     Everything about every subject is checked before the first frame is decoded.
     """

@@ -17,7 +17,7 @@ from ...bench.io.files import (
     check_output_folder,
 )
 from ...bench.io.lock import locked
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,7 @@ class SynthSettings(ExecutionOptions):
     tracked mesh does not have them. 0 to 4."""
 
 
+@command("synth", group="data")
 def synth(settings: SynthSettings, progress: Progress) -> CommandResult:
     """Render a synthetic multi-view capture in the GaussianAvatars/VHAP layout."""
     out, execution = Path(settings.out), settings.execution

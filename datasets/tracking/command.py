@@ -13,7 +13,7 @@ from ...bench.io.files import write_json
 from ...bench.manifest import cut_of
 from ...bench.progress import counted
 from ...bench.protocol import evenly_with_ends
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from ...bench.tflite import LICENCE, WHEEL, fetch_networks
 from .settings import TrackSettings
 from .work import WORK, check_work_folder, make_work_folder
@@ -27,8 +27,18 @@ ROWS, COLUMNS = 3, 4
 """Timesteps and cameras of the picture."""
 
 
+@command(
+    "track",
+    group="data",
+    writes="out",
+    kinds=("captures",),
+    programs={
+        "vhap": "headbench.datasets.tracking.needs:vhap",
+        "pixel3dmm": "headbench.datasets.tracking.needs:pixel3dmm",
+    },
+)
 def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> CommandResult:
-    """Track the head model of a capture in its images and write a capture with this tracking.
+    """Track the head model of a capture in its images, without using its tracking.
 
     Writes under ``settings.out`` the capture (images linked), ``track.json`` with every timestep's residuals and
     ``overlay.png``. Intermediate results are stored there, so that an interrupted call can be resumed.

@@ -12,8 +12,7 @@ from ...bench.specs import CommandResult
 from ..head.refit.command import target_head
 from ..head.refit.rewrite import link_or_copy
 from ..monocular.clip import check_subject, subject_of
-from ..tracker_files.command import import_tracking
-from ..tracker_files.settings import ImportTrackingSettings
+from ..tracker_files.command import ImportTrackingSettings, import_tracking
 from ..video.decode import is_video, probe_video
 from .programs import LOG, WorkingFolder, check_program, export_folder, run_steps
 

@@ -64,6 +64,11 @@ def field_texts(cls: type) -> dict[str, str]:
         if not dataclasses.is_dataclass(base) or base.__module__ == "builtins":
             continue
         texts.update(section_texts(inspect.getdoc(base) or "", "Attributes"))
+        if parameters := section_texts(
+            inspect.getdoc(base) or "", "Parameters"
+        ):  # of the function of a command
+            texts.update(parameters)
+            continue
         body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body  # type: ignore[attr-defined]
         for field, text in itertools.pairwise(body):
             is_text = isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)

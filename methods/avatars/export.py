@@ -11,7 +11,7 @@ from ...bench.contracts import HeadAsset, HeadPose, Progress, SplatAvatar, no_pr
 from ...bench.engine.stored import StoredAvatar, open_avatar
 from ...bench.errors import InputError
 from ...bench.io.files import check_writable
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from ..ops.harmonics import harmonic_colors
 from ..shared.avatar_files import read_shared_head
 from ..shared.rendering import view_of
@@ -41,18 +41,21 @@ def open_splats(settings: AvatarOptions) -> tuple[StoredAvatar, SplatAvatar]:
     return stored, avatar
 
 
+@command("export ply", group="export")
 def export_ply(settings: ExportPlySettings, progress: Progress = no_progress) -> CommandResult:
-    """Write an avatar in one pose as a 3D Gaussian splatting PLY; see `export_pose`."""
+    """Write an avatar in one pose as a 3D Gaussian splatting PLY."""
     return export_pose(settings, "ply", progress)
 
 
+@command("export glb", group="export")
 def export_glb(settings: ExportGlbSettings, progress: Progress = no_progress) -> CommandResult:
-    """Write an avatar in one pose as binary glTF with splats; see `export_pose`."""
+    """Write an avatar in one pose as binary glTF with splats."""
     return export_pose(settings, "glb", progress)
 
 
+@command("export sog", group="export")
 def export_sog(settings: ExportSogSettings, progress: Progress = no_progress) -> CommandResult:
-    """Write an avatar in one pose as SOG; see `export_pose`."""
+    """Write an avatar in one pose as SOG, a compact format of web viewers."""
     return export_pose(settings, "sog", progress)
 
 

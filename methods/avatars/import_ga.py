@@ -20,7 +20,7 @@ from ...bench.engine.stored import AVATAR_FILE, SAME_SHAPE, write_avatar_record
 from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest_file, user_files
 from ...bench.io.lock import LOCK_FILE
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from ...datasets.clip import CaptureClip
 from ...datasets.ga.tracking import TeethPolicy, Tracking, find_head, read_animation
 from ...datasets.head.arrays import HeadArrays
@@ -53,8 +53,9 @@ class HeadSettings:
     teeth: TeethPolicy = "auto"
 
 
+@command("import ga", group="export", writes="out", kinds=("an avatar",))
 def import_avatar(settings: ImportGASettings, progress: Progress = no_progress) -> CommandResult:
-    """Import a GaussianAvatars PLY, with its flame_param.npz or its capture, as an avatar of the method ga.
+    """Import a GaussianAvatars PLY as an avatar of the method ga.
 
     Raises `InputError` for invalid files and for an output folder that is not empty.
     """

@@ -13,17 +13,19 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+import tyro
 from matplotlib.axes import Axes
 
 from ...bench.condition import Condition
 from ...bench.contracts import Budget, FloatArray, FrameKey, Progress, no_progress
 from ...bench.engine.scoring import FULL
 from ...bench.errors import InputError
+from ...bench.experiments.curve import Over
 from ...bench.experiments.tracking import tracking_error
 from ...bench.io.files import write_text
 from ...bench.manifest import ClipRecord, MethodRecord
 from ...bench.rows import ALL, Rows
-from ...bench.specs import CommandResult, MetricSpec
+from ...bench.specs import CommandResult, MetricSpec, command
 from ...bench.terminal import table
 from ..aggregate import subject_means
 from ..plots import MARKERS, SMALL, cost_axis, plot_file, show_missing, start_axes
@@ -31,7 +33,27 @@ from ..runs import RunData
 from ..statistics.paired import LEAST_SUBJECTS, interval
 from ..writers import csv_text, pipe_table
 from .points import HELD_OUT, MEASURED, CurvePoint, column, mean_point, points_text
-from .settings import CurveReportSettings
+
+
+@dataclass(frozen=True)
+class CurveReportSettings:
+    """Runs of `headbench run curve` as one curve: of several subjects, or of several methods of a subject.
+
+    Prints the means over subjects and the best method for each cost of a training, with 95 % intervals of the crossings of two methods."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders that `headbench run curve` wrote."""
+
+    out: str
+    """Folder to write: curve.csv and curve.png."""
+
+    over: Over = "budget"
+    """What the trainings differ in, as for `headbench run curve`."""
+
+    def __post_init__(self) -> None:
+        if not self.runs:
+            raise ValueError("runs: at least one folder")
+
 
 Lines: TypeAlias = Mapping[str, Mapping[str, Sequence[tuple[float, float]]]]
 """Pairs of cost and quality by method and subject."""
@@ -178,8 +200,10 @@ def curve_report(out: Path, over: str) -> CommandResult:
     return joined_curve([RunData.read(out)], over, out)
 
 
+@command("report curve", group="inspect", writes="out")
 def curve_runs(settings: CurveReportSettings, progress: Progress = no_progress) -> CommandResult:
-    """Join runs of curves; see the settings and, for errors, `joined_curve`."""
+    """Join runs of `headbench run curve`: means over subjects, and the best method for each cost of a
+    training."""
     runs, out = [RunData.read(Path(run)) for run in settings.runs], Path(settings.out)
     return joined_curve(runs, settings.over, out)
 

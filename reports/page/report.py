@@ -20,7 +20,7 @@ from ...bench.io.images import probe_image
 from ...bench.io.provenance import COMPOSITE, source_type
 from ...bench.io.style import SHAPES, policy_hash, stylesheet
 from ...bench.protocol import TASK_TITLES
-from ...bench.specs import CommandResult, MetricSpec
+from ...bench.specs import CommandResult, MetricSpec, command
 from ..aggregate import summarise
 from ..compact import compact
 from ..drawing import colour_map
@@ -71,8 +71,9 @@ def write_page(run: FinishedRun) -> list[Path]:
     return [out]
 
 
+@command("report", group="inspect")
 def write_report(settings: PageSettings, progress: Progress = no_progress) -> CommandResult:
-    """`headbench report`: read runs and write the page."""
+    """Write an HTML report of finished runs; it opens without a network."""
     out = Path(settings.out or ("report" if settings.split else "report.html"))
     max_mb = settings.max_mb or (MAX_SPLIT_MB if settings.split else MAX_MB)
     if settings.split:

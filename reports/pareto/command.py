@@ -11,7 +11,7 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_output_folder, write_text
 from ...bench.progress import counted
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from ...bench.terminal import table
 from .settings import ParetoSettings
 
@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
 
 
+@command("report pareto", group="inspect", writes="out")
 def pareto_runs(settings: ParetoSettings, progress: Progress = no_progress) -> CommandResult:
-    """Plot quality against size and frame time of finished runs, with the Pareto front, and write CSV."""
+    """Plot quality against size and frame time of runs, with the Pareto front."""
     out = Path(settings.out)
     return pareto(settings.runs, out, settings.task, settings.metric, settings.time, settings.reference)
 

@@ -22,7 +22,7 @@ from ...bench.io.images import quantise, read_png, write_png
 from ...bench.io.provenance import COMPOSITE, RENDER
 from ...bench.io.video import browser_encoder, write_browser_video
 from ...bench.progress import counted
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from .settings import RenderSettings
 
 ORBIT = "orbit"
@@ -39,8 +39,9 @@ class Shot(NamedTuple):
     captured: Callable[[], ByteArray] | None = None
 
 
+@command("render", group="inspect", writes="out")
 def render_avatar(settings: RenderSettings, progress: Progress = no_progress) -> CommandResult:
-    """Render a stored avatar; see the settings.
+    """Render a stored avatar: frames of a task, or an orbit; as images and video.
 
     Raises `InputError` for an invalid avatar, a capture that the method does not support, and cameras and
     timesteps that the capture lacks.

@@ -17,7 +17,7 @@ from ...bench.gate.settings import DEPENDENT, BaselineOptions
 from ...bench.options import DependentOptions
 from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
-from ...bench.specs import CommandResult, MetricSpec
+from ...bench.specs import CommandResult, MetricSpec, command
 from ...bench.terminal import table
 
 if TYPE_CHECKING:
@@ -110,8 +110,9 @@ FIELDS = (
 )
 
 
+@command("compare", group="compare")
 def compare_runs(settings: CompareSettings, progress: Progress = no_progress) -> CommandResult:
-    """Test paired differences between methods of finished runs, or compare one run with a baseline file.
+    """Test differences between methods, or compare a run with a baseline file (CI).
 
     Raises `InputError` for invalid combinations of runs, methods and metrics.
     """

@@ -17,7 +17,7 @@ from typing import Any
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError, UnavailableError, install_extra
-from ...bench.specs import CommandResult
+from ...bench.specs import CommandResult, command
 from .live import LOOPBACK, with_live_signal
 from .scene import Scene, open_scene
 from .session import Session
@@ -26,8 +26,9 @@ from .settings import ViewSettings
 log = logging.getLogger(__name__)
 
 
+@command("view", group="inspect")
 def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> CommandResult:
-    """Serve until interrupted, or for a number of seconds."""
+    """View avatars in a browser, side by side, with sliders and recorded sequences."""
     viser()
     check_port(settings.port)
     with tempfile.TemporaryDirectory(prefix="headbench-view-") as kept:

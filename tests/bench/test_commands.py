@@ -1,11 +1,12 @@
 """Commands that packages offer: their settings become options, their findings output and exit code."""
 
 import dataclasses
-import inspect
 import json
 import re
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from headbench.bench import cli, commands, parsing, registry, specs
@@ -15,7 +16,7 @@ from headbench.bench.io.lock import locked
 TOY = '''
 from dataclasses import dataclass
 import tyro
-from headbench import CommandSpec, CommandResult, InputError
+from headbench import CommandResult, InputError, command
 
 @dataclass(frozen=True)
 class Settings:
@@ -33,23 +34,27 @@ class Lists:
     levels: tuple[float, ...] = (1.0,)
     """How much."""
 
-def count(settings, progress):
+@command("count", group="toys")
+def count(settings: Lists, progress):
+    """Count it."""
     return CommandResult("", {"lists": [settings.paths, settings.names, settings.levels]})
 
-def look(settings, progress):
+@command("look", group="toys")
+def look(settings: Settings, progress):
+    """Look
+    at it.
+
+    More.
+    """
     if settings.limit < 0:
         raise InputError("command line", "limit", "at least 0", str(settings.limit))
     code = 3 if settings.limit == 3 else None
     return CommandResult(f"looked at {settings.path}", {"limit": settings.limit}, settings.limit < 1, code)
 
-def spec(settings="toy_command:Settings", function="toy_command:look", **more):
-    return CommandSpec("toy", "toys", "Look at it.", settings, function, **more)
-
-LOOK = spec()
-COUNT = spec("toy_command:Lists", "toy_command:count")
-MAKE = spec(writes="path")
-NO_SETTINGS, NO_DATACLASS = spec("toy_command:not_there"), spec("toy_command:look")
-NO_FUNCTION = spec(function="toy_command:not_there")
+@command("make", group="toys", writes="path")
+def make(settings: Settings, progress):
+    """Make it."""
+    return CommandResult("", {})
 '''
 
 
@@ -65,8 +70,8 @@ def toys(tmp_path_factory):
 def offer(monkeypatch, toys):
     monkeypatch.syspath_prepend(toys)
 
-    def offer(*names, spec="toy_command:LOOK"):
-        own = [EntryPoint("list", "headbench.bench.builtin:LIST", "headbench.commands")]
+    def offer(*names, spec="toy_command:look"):
+        own = [EntryPoint("list", "headbench.bench.listing:list_installed", "headbench.commands")]
         entries = [*own, *(EntryPoint(name, spec, "headbench.commands") for name in names)]
         monkeypatch.setattr(registry, "entry_points", lambda group: entries)
 
@@ -81,13 +86,12 @@ def test_settings_are_options_and_findings_are_printed(offer, capsys):
     assert json.loads(capsys.readouterr().out) == {"limit": 0.25}
     assert [cli.main(["look", "here", "--limit", limit]) for limit in ("2", "-1", "3")] == [1, 2, 3]
     assert "at least 0" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        cli.main(["look", "--help"])
+    assert cli.main(["look", "--help"]) == 0
     assert "Most that may be wrong." in capsys.readouterr().out
 
 
 def test_lists_have_commas_or_spaces(offer, capsys):
-    offer("count", spec="toy_command:COUNT")
+    offer("count", spec="toy_command:count")
     for words, lists in (
         (["a,b", "c"], [["a,b", "c"], [], [1.0]]),  # a comma in a file's name is one
         (["a", "--names", "x,y", "z", "--levels", "0.5,2"], [["a"], ["x", "y", "z"], [0.5, 2.0]]),
@@ -104,14 +108,13 @@ def test_lists_have_commas_or_spaces(offer, capsys):
     ("words", "named"),
     [("look", "What to look at"), ("look here --limti 1", "--limti"), ("look here --limit much", "--limit")],
 )
-def test_words_that_do_not_parse_end_in_one_line(offer, capsys, words, named):
+def test_words_that_do_not_parse_are_named(offer, capsys, words, named):
     offer("look")
     assert cli.main(words.split()) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("headbench: command line: ")
-    assert named in line
-    assert line.count("--help") == 1
-    assert not re.search("[│─╭|]", line)
+    printed = capsys.readouterr()
+    assert named in printed.err
+    assert "look --help" in printed.err
+    assert printed.out == ""
 
 
 def test_two_words_share_the_first(offer, capsys):
@@ -155,7 +158,7 @@ def test_help_lists_commands_in_groups(capsys):
 def test_a_word_calls_a_command_alone_and_before_a_second_word(offer, capsys, monkeypatch):
     entries = [
         EntryPoint(name, f"toy_command:{spec}", "headbench.commands")
-        for name, spec in (("make", "LOOK"), ("make twice", "COUNT"))
+        for name, spec in (("make", "look"), ("make twice", "count"))
     ]
     monkeypatch.setattr(registry, "entry_points", lambda group: entries)
     assert cli.main(["make", "here"]) == 0
@@ -164,38 +167,47 @@ def test_a_word_calls_a_command_alone_and_before_a_second_word(offer, capsys, mo
     assert json.loads(capsys.readouterr().out)["lists"] == [["here"], [], [1.0]]
 
 
-BROKEN = {
-    "not_there:LOOK": ("not_there", "broken: "),
-    "toy_command:CommandResult": ("a CommandSpec", "broken: "),
-    "toy_command:NO_SETTINGS": ("not_there", "Look"),
-    "toy_command:NO_DATACLASS": ("a dataclass", "Look"),
-    "toy_command:NO_FUNCTION": ("not_there", "Look"),
-}
+BROKEN = {"not_there:look": "not_there", "toy_command:Settings": "a function with @command"}
 
 
-@pytest.mark.parametrize("spec", BROKEN)
-def test_a_broken_command_is_listed_and_raises_only_when_called(offer, capsys, spec):
-    why, listed = BROKEN[spec]
-    offer("look", "look twice", spec=spec)
+@pytest.mark.parametrize("function", BROKEN)
+def test_a_broken_command_is_listed_and_raises_only_when_called(offer, capsys, function):
+    offer("look", "look twice", spec=function)
     assert cli.main(["list", "commands"]) == 0
-    assert re.search(rf"(?m)^look twice +{listed}", capsys.readouterr().out)
+    assert re.search(r"(?m)^look twice +broken: ", capsys.readouterr().out)
     for words in (["look", "here"], ["look", "twice", "here"]):
         assert cli.main(words) == 2
-        assert why in capsys.readouterr().err
+        assert BROKEN[function] in capsys.readouterr().err
 
 
-def test_every_command_has_its_settings_and_its_function():
-    for plugin in registry.discover("commands").values():
-        settings = registry.resolve(plugin.spec.settings)
-        parameters = [*inspect.signature(registry.resolve(plugin.spec.function)).parameters.values()]
-        assert [parameter.name for parameter in parameters] == ["settings", "progress"], plugin.name
-        assert parameters[0].annotation in (settings.__name__, settings.__base__.__name__), plugin.name
-        assert plugin.spec.name == plugin.name
-        assert {*plugin.spec.kinds} <= {*KINDS}, plugin.name
+def test_the_command_of_the_page_lists_the_worst_frames(run, offer, capsys, tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "command.md").read_text()
+    (tmp_path / "worst.py").write_text(re.search("```python\n(.*?)```", page, re.DOTALL)[1])
+    monkeypatch.syspath_prepend(tmp_path)
+    offer("worst", spec="worst:worst")
+    assert cli.main(["worst", str(run), "--count", "2", "--json"]) == 0
+    listed = [each["value"] for each in json.loads(capsys.readouterr().out)]
+    rows = pq.read_table(run / "rows.parquet").to_pylist()
+    assert (
+        listed
+        == sorted(row["value"] for row in rows if (row["metric"], row["region"]) == ("psnr", "full"))[:2]
+    )
+    assert cli.main(["worst", "--help"]) == 0
+    assert "Number of frames. (default: 5)" in capsys.readouterr().out
+    assert cli.main(["worst"]) == 2
+    assert "Folder of the run" in capsys.readouterr().err
+
+
+def test_the_index_has_every_command_of_headbench_as_it_is():
+    assert registry.INDEX.read_text() == registry.index_text(), "`make index` writes it"
+    for name, plugin in registry.discover("commands").items():
+        assert plugin.spec.name == name
+        assert plugin.spec.summary.endswith(".")
+        assert {*plugin.spec.kinds} <= {*KINDS}, name
 
 
 def test_a_folder_that_is_written_is_locked(offer, capsys, tmp_path):
-    offer("make", spec="toy_command:MAKE")
+    offer("make", spec="toy_command:make")
     with locked(tmp_path):
         assert cli.main(["make", str(tmp_path)]) == 2
     assert "no other process works in" in capsys.readouterr().err

@@ -11,7 +11,7 @@ import numpy as np
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import write_json
-from ....bench.specs import CommandResult
+from ....bench.specs import CommandResult, command
 from ..arrays import HeadArrays
 from .settings import RefitCommandSettings
 
@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 BLOCKS_FOLDER = "refit-blocks"
 
 
+@command("prepare refit", group="data", writes="out", kinds=("captures",))
 def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progress) -> CommandResult:
-    """Refit the tracking of a capture to another head model, with residuals in millimetres and a heat map.
+    """Refit the tracking of a capture to another head model.
 
     A killed command continues at the last block of timesteps when it is run again.
 

@@ -3,30 +3,51 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
+
+import tyro
 
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import ExitCode, UnavailableError
-from ....bench.specs import CommandResult
-from .settings import SubmissionCheckSettings, SubmissionWriteSettings
+from ....bench.specs import CommandResult, command
 
 SHOWN = 20
 
 
-def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_progress) -> CommandResult:
-    """Write a submission to the NeRSemble benchmark and report the loss of its codec; exit code 3 without ffmpeg.
+@command("submission write", group="export")
+def submission_write(
+    frames: tyro.conf.Positional[str],
+    zip: tyro.conf.Positional[str],
+    track: Literal["nvs", "mono_flame_avatar"],
+    method: str = "",
+    data: str | None = None,
+    progress: Progress = no_progress,
+) -> CommandResult:
+    """Write a submission to the NeRSemble benchmark; exit code 3 without ffmpeg.
 
     Videos are H.264 of constant rate factor 14, YUV 4:2:0, as the benchmark's documentation says. The cost is measured on
     the encoded frames themselves.
+
+    Parameters
+    ----------
+    frames : str
+        Folder with PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png, or a run whose subjects are the participants.
+    zip : str
+        File to write.
+    track : str
+        Task of the benchmark.
+    method : str
+        Method of a run with several.
+    data : str | None
+        The benchmark's folder, whose tracking has the number of frames of each sequence. Without it, the published totals are checked.
     """
     from .submission import after_encoding, decibels, find_frames, write_submission
     from .tracks import TRACKS
 
-    track = TRACKS[settings.track]
-    data = None if settings.data is None else Path(settings.data)
-    frames = find_frames(Path(settings.frames), track, settings.method, data)
-    out = Path(settings.zip)
+    task, out = TRACKS[track], Path(zip)
+    found = find_frames(Path(frames), task, method, None if data is None else Path(data))
     try:
-        encoded = write_submission(frames, track, out, progress)
+        encoded = write_submission(found, task, out, progress)
     except UnavailableError as error:
         return CommandResult(str(error), {"error": str(error)}, False, ExitCode.NO_VERDICT)
     lines = [f"{'video':<56}{'frames':>7}{'MB':>8}{'dB to frames':>14}"]
@@ -50,18 +71,35 @@ def submission_write(settings: SubmissionWriteSettings, progress: Progress = no_
     return CommandResult("\n".join(lines), data_out)
 
 
-def submission_check(settings: SubmissionCheckSettings, progress: Progress = no_progress) -> CommandResult:
-    """Check a submission to the NeRSemble benchmark as its server does and decode every frame."""
+@command("submission check", group="export")
+def submission_check(
+    zip: tyro.conf.Positional[str],
+    track: Literal["", "nvs", "mono_flame_avatar"] = "",
+    data: str | None = None,
+    progress: Progress = no_progress,
+) -> CommandResult:
+    """Check a submission to the NeRSemble benchmark as its server does.
+
+    Exit code 0: no fault; 1: a fault; 2: not a readable zip.
+
+    Parameters
+    ----------
+    zip : str
+        The submission.
+    track : str
+        Task of the benchmark; default: the one that the zip has most files of.
+    data : str | None
+        The benchmark's folder, whose tracking has the number of frames of each sequence. Without it, the published totals are checked.
+    """
     from .submission import check_submission
 
-    data = None if settings.data is None else Path(settings.data)
-    track, issues = check_submission(Path(settings.zip), data, settings.track, progress)
-    lines = [f"{settings.zip}: track {track.name}"]
+    task, issues = check_submission(Path(zip), None if data is None else Path(data), track, progress)
+    lines = [f"{zip}: track {task.name}"]
     for title, found in (("Would be refused", issues.refused), ("Worth a look", issues.noted)):
         if found:
             lines += [f"{title}:", *(f"  {line}" for line in found[:SHOWN])]
             lines += [f"  and {len(found) - SHOWN} more"] if len(found) > SHOWN else []
     if not issues.refused:
         lines.append("Nothing that the server would refuse.")
-    data_out = {"track": track.name, "refused": issues.refused, "noted": issues.noted}
+    data_out = {"track": task.name, "refused": issues.refused, "noted": issues.noted}
     return CommandResult("\n".join(lines), data_out, not issues.refused)

@@ -11,17 +11,44 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ....bench.contracts import Camera, FloatArray, HeadPose, Progress, no_progress
+from ....bench.engine.config import AvatarFolder
 from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE, open_avatar
 from ....bench.errors import InputError
 from ....bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_arrays
 from ....bench.io.images import quantise, write_png
-from ....bench.specs import CommandResult
+from ....bench.specs import CommandResult, command
 from ...head.arrays import HeadArrays, read_head
 from ...head.loaders import load_head
 from ...head.teeth import with_teeth_where_possible
 from ..recording import read_calibration
-from .settings import SubmissionRenderSettings
 from .tracks import MEMBERS, MONO, BenchmarkTrack, tracking_file
+
+
+@dataclass(frozen=True)
+class SubmissionRenderSettings:
+    """Render the test frames of a participant of the NeRSemble benchmark's monocular track from a stored avatar, which was
+    trained on the participant's training sequences."""
+
+    avatar: AvatarFolder
+
+    data: str
+    """The benchmark's folder, as nersemble-benchmark-download leaves it: it holds mono_flame_avatar/."""
+
+    participant: str
+    """Participant of the avatar: 393, 404, 461, 477 or 486."""
+
+    out: str
+    """Folder to write: OUT/PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png."""
+
+    head: str | None = None
+    """FLAME 2023 (flame2023.pkl); default: the head model beside the avatar."""
+
+    method: str = ""
+    """Method of the avatar as package.module:SPEC, where it is not registered."""
+
+    device: str = "cpu"
+    """Where to render."""
+
 
 MOST_SCALE = 1000.0
 EULER_TOLERANCE = 1e-3
@@ -112,8 +139,9 @@ log = logging.getLogger(__name__)
 WHITE = (1.0, 1.0, 1.0)
 
 
+@command("submission render", group="export", writes="out")
 def render_participant(settings: SubmissionRenderSettings, progress: Progress = no_progress) -> CommandResult:
-    """Render every frame of a participant's test sequences from all cameras of the track.
+    """Render the test frames of a NeRSemble benchmark participant.
 
     Raises `InputError` for an unknown participant, an avatar that cannot be read, and tracking or cameras that are missing or
     damaged, all before the first frame.

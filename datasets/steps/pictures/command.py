@@ -12,7 +12,7 @@ import tyro
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import write_json
-from ....bench.specs import CommandResult
+from ....bench.specs import CommandResult, command
 from ...options import CaptureOptions
 
 
@@ -42,8 +42,9 @@ class StepsSettings(CaptureOptions):
 JAW_PICTURE, CLUSTER_PICTURE, NUMBERS = "jaw_bases.png", "expression_clusters.png", "steps.json"
 
 
+@command("inspect steps", group="inspect", writes="out")
 def steps(settings: StepsSettings, progress: Progress = no_progress) -> CommandResult:
-    """Plot the jaw bases and expression clusters computed from a capture's training frames.
+    """Plot the jaw bases and expression clusters of a capture's training frames.
 
     Raises `InputError` for a capture that the reader refuses, for counts below 1, and for a head without a face
     region.

@@ -10,7 +10,7 @@ import tyro
 
 from ....bench.contracts import Progress
 from ....bench.errors import InputError
-from ....bench.specs import CommandResult
+from ....bench.specs import CommandResult, command
 from ...lint.rules import spans
 from ...options import CaptureOptions
 
@@ -45,8 +45,9 @@ class TongueSettings(CaptureOptions):
 DECISIONS_FILE = "tongue.yaml"
 
 
+@command("prepare tongue", group="data", writes="out")
 def tongue(settings: TongueSettings, progress: Progress) -> CommandResult:
-    """Find the frames that show the tongue, for review on a contact sheet and with overrides.
+    """Find the frames that show the tongue, for review on a contact sheet.
 
     Raises `InputError` before any image is read, for captures and decisions that cannot be read.
     """

@@ -17,7 +17,7 @@ from ....bench.engine.stored import avatar_digest, open_avatar, write_avatar_rec
 from ....bench.errors import InputError
 from ....bench.io.images import quantise
 from ....bench.protocol import evenly_with_ends
-from ....bench.specs import CommandResult
+from ....bench.specs import CommandResult, command
 from ...shared.avatar_files import COMPACT_FILE, read_shared_head
 from ...shared.losses import picture_ssim, psnr, squared_error
 from ..export import neutral_pose
@@ -31,8 +31,9 @@ of the exact avatar, from the mean squared error over all frames, None if they a
 WHOLE = "all"
 
 
+@command("export compact", group="export", writes="out", kinds=("an avatar",))
 def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) -> CommandResult:
-    """Store an avatar of a native method through the codec, and measure its size and quality; see the settings.
+    """Store an avatar of a native method by the common codec, at a tenth of its size or less.
 
     Raises `InputError` for a folder without the files of a training, and for the capture of another subject.
     """

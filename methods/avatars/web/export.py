@@ -25,7 +25,7 @@ from ....bench.io.images import encode_image, quantise
 from ....bench.io.provenance import RENDER, note, source_type, tool
 from ....bench.io.style import policy_hash, stylesheet
 from ....bench.protocol import evenly_with_ends
-from ....bench.specs import CommandResult, ResolutionRule
+from ....bench.specs import CommandResult, ResolutionRule, command
 from ....datasets.head.arrays import HeadArrays
 from ....datasets.head.rotations import matrix_to_quaternion
 from ....datasets.novelty import displacement_metric
@@ -305,8 +305,9 @@ DISTANCE_BY_HEIGHT = 2.6
 """Distance of the camera relative to the extent of the splats."""
 
 
+@command("export html", group="export")
 def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) -> CommandResult:
-    """Bake, write, read back and compare; see the settings."""
+    """Write an avatar as one HTML file with sliders for expressions and joints."""
     out = Path(settings.out)
     check_writable(out, "--out")
     stored, avatar = open_splats(settings)

@@ -31,7 +31,7 @@ from ....bench.io.lock import locked
 from ....bench.progress import log_to_file
 from ....bench.registry import get
 from ....bench.rows import Rows
-from ....bench.specs import CommandResult
+from ....bench.specs import CommandResult, command
 from ...flashavatar.config import FlashAvatarConfig
 from ...rgbavatar.config import RGBAvatarConfig
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
@@ -137,8 +137,9 @@ class Difference:
         return float(student_t.sf(distance / error, len(apart) - 1))
 
 
+@command("run parity", group="compare", writes="out", kinds=("captures",))
 def compare(settings: ParitySettings, progress: Progress = no_progress) -> CommandResult:
-    """Train and score both methods, and write the table of their differences; see the command."""
+    """Compare a method with its authors' code on one capture at equal settings."""
     out = Path(settings.out)
     config = run_config(settings, out)
     check_executor(settings.execution, config.device)

@@ -129,4 +129,4 @@ def test_every_specification_and_protocol_is_exported():
         for name, value in vars(module).items()
         if isinstance(value, type) and value.__module__ == module.__name__
     }
-    assert public - set(headbench.__all__) <= {"ExitCode", "Interruption"}
+    assert public - set(headbench.__all__) <= {"CommandSpec", "ExitCode", "Interruption"}

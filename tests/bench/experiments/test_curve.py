@@ -16,14 +16,12 @@ from headbench.bench.engine import run as runner
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.experiments import curve as module
-from headbench.bench.experiments.curve import curve_run
-from headbench.bench.experiments.curve_settings import CurveSettings
+from headbench.bench.experiments.curve import CurveSettings, curve_run
 from headbench.bench.experiments.held_out import hold_out
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.reports.curve import curve as report
-from headbench.reports.curve.curve import curve_runs
+from headbench.reports.curve.curve import CurveReportSettings, curve_runs
 from headbench.reports.curve.points import MEASURED
-from headbench.reports.curve.settings import CurveReportSettings
 
 from ...datasets.flat_renderer import flat_pictures
 from ...world import run_on

@@ -19,8 +19,7 @@ from headbench.bench.experiments.extremes import (
     path_poses,
     sampled_poses,
 )
-from headbench.bench.experiments.robustness import RECORD_FILE, extremes_run
-from headbench.bench.experiments.robustness_settings import ExtremesSettings
+from headbench.bench.experiments.robustness import RECORD_FILE, ExtremesSettings, extremes_run
 from headbench.bench.experiments.specs import AGAINST_TRUTH
 from headbench.bench.experiments.specs import MEASURES as STABILITY
 from headbench.bench.io.images import read_png

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
 from headbench.bench.experiments.reenactment import RigidMean, retarget
-from headbench.bench.experiments.robustness import RECORD_FILE, reenact_run
-from headbench.bench.experiments.robustness_settings import ReenactSettings
+from headbench.bench.experiments.robustness import RECORD_FILE, ReenactSettings, reenact_run
 from headbench.bench.io.images import read_png
 from headbench.reports.robustness.sheets import SHEET_FILE
 

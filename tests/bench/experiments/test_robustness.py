@@ -5,8 +5,12 @@ import json
 import pandas as pd
 import pytest
 
-from headbench.bench.experiments.robustness import extremes_run, reenact_run
-from headbench.bench.experiments.robustness_settings import ExtremesSettings, ReenactSettings
+from headbench.bench.experiments.robustness import (
+    ExtremesSettings,
+    ReenactSettings,
+    extremes_run,
+    reenact_run,
+)
 from headbench.bench.registry import get
 
 pytestmark = pytest.mark.usefixtures("no_sheets")

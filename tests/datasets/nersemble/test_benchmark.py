@@ -22,7 +22,6 @@ from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.nersemble.benchmark import tracks
 from headbench.datasets.nersemble.benchmark.command import submission_write
 from headbench.datasets.nersemble.benchmark.render import read_sequence
-from headbench.datasets.nersemble.benchmark.settings import SubmissionWriteSettings
 from headbench.datasets.nersemble.benchmark.submission import after_encoding, check_submission, decibels
 from headbench.datasets.nersemble.benchmark.tracks import MONO, NVS, tracking_file
 
@@ -164,7 +163,7 @@ def frames(track, tmp_path):
 
 
 def written(frames, out, **others):
-    return submission_write(SubmissionWriteSettings(str(frames), str(out), MONO.name, **others), no_progress)
+    return submission_write(str(frames), str(out), MONO.name, **others)
 
 
 def test_what_is_written_passes_the_check(track, frames, ffmpeg, tmp_path, capsys):

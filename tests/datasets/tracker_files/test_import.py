@@ -13,9 +13,8 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.images import read_image
-from headbench.datasets.tracker_files.command import import_tracking
+from headbench.datasets.tracker_files.command import ImportTrackingSettings, import_tracking
 from headbench.datasets.tracker_files.formats import FORMATS
-from headbench.datasets.tracker_files.settings import ImportTrackingSettings
 
 from ..head.toy import toy_head
 from ..monocular.videos import recording_of
