@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 FRAME = ["subject", "sequence", "timestep", "camera"]
 """Columns that name a frame."""
 STATUSES = ("ok", "missing", "failed")
+FULL = "full"
+"""The region over which every metric is computed: the whole frame."""
 SUSPECT = "suspect: "
 """Prefix of the reason of a measured value that is suspiciously good, see `MetricSpec.suspect_above`."""
 

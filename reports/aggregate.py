@@ -8,8 +8,7 @@ from typing import Literal
 
 import pandas as pd
 
-from ..bench.engine.scoring import FULL
-from ..bench.rows import ALL, FRAME, LEFT_OUT, Rows
+from ..bench.rows import ALL, FRAME, FULL, LEFT_OUT, Rows
 
 
 @dataclass(frozen=True)

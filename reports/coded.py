@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..bench.engine.config import CODED
-from ..bench.engine.scoring import FULL
 from ..bench.errors import InputError
 from ..bench.manifest import Manifest, MethodRecord
-from ..bench.rows import ALL, Row, Rows
+from ..bench.rows import ALL, FULL, Row, Rows
 from ..bench.specs import MetricSpec
 from .aggregate import subject_means
 

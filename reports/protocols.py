@@ -10,12 +10,12 @@ import tyro
 
 from ..bench.contracts import FrameKey, Progress
 from ..bench.engine.config import CANONICAL
-from ..bench.engine.scoring import FULL
 from ..bench.errors import InputError
 from ..bench.io.files import check_writable, write_text
 from ..bench.named_protocol import NamedProtocol, TaskFrames, named_protocols, protocol_named
 from ..bench.protocol import TASK_TITLES
 from ..bench.registry import get
+from ..bench.rows import FULL
 from ..bench.specs import CommandResult, MetricSpec
 from ..bench.terminal import table
 from .aggregate import summarise

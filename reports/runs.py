@@ -14,12 +14,11 @@ from typing import Any, Self
 from ..bench.contracts import ByteArray, Clip, FrameKey
 from ..bench.engine.captures import open_run_clips
 from ..bench.engine.config import RunOptions
-from ..bench.engine.scoring import FULL
 from ..bench.engine.store import FinishedRun, RunFolder
 from ..bench.errors import InputError
 from ..bench.manifest import ClipRecord, Manifest, MethodRecord, cut_of
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, joined_protocol, missing_tasks
-from ..bench.rows import ALL, Rows
+from ..bench.rows import ALL, FULL, Rows
 from ..bench.source import is_outside
 from ..bench.specs import MetricSpec
 from .cameras import SPLIT_TASK, explained, unseen_cameras

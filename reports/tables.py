@@ -12,10 +12,9 @@ from typing import Literal
 
 from ..bench.condition import CONDITION_MARK
 from ..bench.contracts import FrameKey
-from ..bench.engine.scoring import FULL
 from ..bench.progress import counted
 from ..bench.protocol import TASK_TITLES
-from ..bench.rows import ALL, Rows
+from ..bench.rows import ALL, FULL, Rows
 from ..bench.specs import DYNAMIC, MetricSpec
 from .aggregate import Aggregate, subject_means, summarise, whole_images
 from .coded import CODED_CHANGE

@@ -17,7 +17,6 @@ from statistics import fmean
 
 import readme_pictures
 
-from headbench.bench.engine.scoring import FULL
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.experiments.robustness import RECORD_FILE
@@ -25,7 +24,7 @@ from headbench.bench.io.files import write_json, write_text
 from headbench.bench.progress import counted
 from headbench.bench.protocol import TASK_TITLES, UNSEEN_CAMERAS
 from headbench.bench.registry import get
-from headbench.bench.rows import Rows
+from headbench.bench.rows import FULL, Rows
 from headbench.reports.aggregate import summarise
 from headbench.reports.coded import coded_labels
 from headbench.reports.curve.curve import CurveData, leaders_text, read_curve

@@ -17,12 +17,11 @@ from matplotlib.axes import Axes
 
 from ...bench.condition import Condition
 from ...bench.contracts import Budget, FloatArray, FrameKey, Progress, no_progress
-from ...bench.engine.scoring import FULL
 from ...bench.errors import InputError
 from ...bench.experiments.tracking import tracking_error
 from ...bench.io.files import write_text
 from ...bench.manifest import ClipRecord, MethodRecord
-from ...bench.rows import ALL, Rows
+from ...bench.rows import ALL, FULL, Rows
 from ...bench.specs import CommandResult, MetricSpec
 from ...bench.terminal import table
 from ..aggregate import subject_means

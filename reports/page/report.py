@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.engine.scoring import FULL
 from ...bench.engine.store import FinishedRun
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
@@ -20,6 +19,7 @@ from ...bench.io.images import probe_image
 from ...bench.io.provenance import COMPOSITE, source_type
 from ...bench.io.style import SHAPES, policy_hash, stylesheet
 from ...bench.protocol import TASK_TITLES
+from ...bench.rows import FULL
 from ...bench.specs import CommandResult, MetricSpec
 from ..aggregate import summarise
 from ..compact import compact

@@ -9,12 +9,11 @@ from math import sqrt
 from pathlib import Path
 from statistics import fmean, stdev, variance
 
-from ...bench.engine.scoring import FULL
 from ...bench.engine.store import RunFolder
 from ...bench.experiments.suite_settings import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, SEEDS_RUN, TRACKED
 from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
-from ...bench.rows import ALL
+from ...bench.rows import ALL, FULL
 from ..aggregate import means_by_seed, whole_images
 from ..runs import WHOLE, FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
