@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Self
 
 from ..bench.contracts import ByteArray, Clip, FrameKey
-from ..bench.engine.captures import open_run_clips
 from ..bench.engine.config import RunOptions
 from ..bench.engine.store import FinishedRun, RunFolder
 from ..bench.errors import InputError
@@ -21,9 +20,12 @@ from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, joined_protocol, miss
 from ..bench.rows import ALL, FULL, Rows
 from ..bench.source import is_outside
 from ..bench.specs import MetricSpec
-from .cameras import SPLIT_TASK, explained, unseen_cameras
-from .coded import check_codecs, with_coded
+from .aggregate import check_codecs, with_coded
 from .tables import AVERAGED
+
+SPLIT_TASK = "self_reenactment"
+"""Scored at all cameras, of which most have training frames. Values at those and at held-out cameras differ by several dB, so
+tables show them separately."""
 
 
 def synthetic_settings(clip: ClipRecord) -> dict[str, Any]:
@@ -117,21 +119,9 @@ class RunData:
 
     @property
     def image_size(self) -> str:
-        """Size of the images, "width x height", or the range if they differ: of the renders or, without them, that of the protocols."""
-        from ..bench.io.images import probe_image
-
-        first_of_camera = {
-            (task, key.subject, key.camera): key for task in self.tasks for key in reversed(self.keys(task))
-        }
-        sizes = set()
-        for (task, _, _), key in first_of_camera.items():
-            paths = (self.render_path(method, task, key) for method in self.methods)
-            if path := next((path for path in paths if path), None):
-                info = probe_image(path)
-                sizes.add((info.width, info.height))
-        if not sizes:
-            texts = ", ".join(protocol.resolution for protocol in self.manifest.protocols.values())
-            sizes = {(int(w), int(h)) for w, h in re.findall(r"(\d+)x(\d+)", texts)}
+        """Size of the scored images, "width x height", or the range if they differ."""
+        texts = ", ".join(protocol.resolution for protocol in self.manifest.protocols.values())
+        sizes = {(int(w), int(h)) for w, h in re.findall(r"(\d+)x(\d+)", texts)}
         return " to ".join(dict.fromkeys(f"{w} x {h}" for w, h in (min(sizes), max(sizes)))) if sizes else ""
 
     @cached_property
@@ -145,6 +135,8 @@ class RunData:
     def _clips(self) -> Mapping[str, Clip]:
         if self.clips is not None:
             return self.clips
+        from ..bench.engine.captures import open_run_clips  # who shows no pictures opens no capture
+
         config, opened = open_run_clips(self.folder.root, RunOptions(trust=True))
         clips = {clip.subject: clip for clip in opened}
         for entry in self.manifest.clips:
@@ -302,6 +294,11 @@ class RunSet:
         records = {label: replace(record, condition="") for label, record in self.records.items()}
         return replace(self, records=records)
 
+    def listing(self, labels: Sequence[str]) -> Self:
+        """The same runs, whose tables list only these methods and rank them all."""
+        records = {label: replace(self.records[label], condition="") for label in labels}
+        return replace(self, records=records, trivial=())
+
     def only(self, labels: Sequence[str]) -> RunSet:
         """Restrict the runs to some of their methods."""
         records = {label: record for label, record in self.records.items() if label in labels}
@@ -391,6 +388,44 @@ class RunSet:
     def machine(self) -> str:
         """Machines used to measure speed."""
         return "; ".join(dict.fromkeys(run.machine for run in self.runs))
+
+
+def explained(keys: Collection[FrameKey], unseen: Collection[tuple[str, str]]) -> str:
+    """Describe seen and unseen cameras of the frames ``keys``, with their number if it is equal for every subject."""
+    cameras = {(key.subject, key.camera) for key in keys}
+    subjects = {subject for subject, _ in cameras}
+    counts = {
+        tuple(sum(name == subject for name, _ in group) for group in (cameras - {*unseen}, unseen))
+        for subject in subjects
+    }
+    seen, held_out = (f" ({count} scored)" for count in counts.pop()) if len(counts) == 1 else ("", "")
+    return f"Seen cameras{seen} have training frames in the capture, of other timesteps; unseen cameras{held_out} have none."
+
+
+def unseen_cameras(
+    manifests: Sequence[Manifest], keys: Collection[FrameKey]
+) -> tuple[frozenset[tuple[str, str]], str]:
+    """The (subject, camera) pairs of self-reenactment without training frames; none and a reason, one sentence, if
+    they are all, none, or not the same in all runs.
+    """
+    unseen = set()
+    cameras = {(key.subject, key.camera) for key in keys}
+    for subject in {key.subject for key in keys}:
+        clips = (clip for manifest in manifests for clip in manifest.clips if clip.subject == subject)
+        own = {camera for name, camera in cameras if name == subject}
+        seen = {frozenset(own & {*clip.training_cameras}) for clip in clips}
+        if len(seen) != 1:
+            return frozenset(), _one_column("the runs differ in which cameras were trained on")
+        unseen |= {(subject, camera) for camera in own.difference(*seen)}
+    if not unseen:
+        return frozenset(), _one_column("methods are trained on all of its cameras") if keys else ""
+    if len(unseen) == len(cameras):
+        return frozenset(), _one_column("methods are trained on none of its cameras")
+    return frozenset(unseen), ""
+
+
+def _one_column(why: str) -> str:
+    return f"Self-reenactment is not split into seen and unseen cameras: {why}."
 
 
 def _of_part(rows: Rows, part: FrameSelection, file: Path) -> Rows:

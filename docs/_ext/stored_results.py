@@ -25,8 +25,7 @@ from headbench.bench.progress import counted
 from headbench.bench.protocol import TASK_TITLES, UNSEEN_CAMERAS
 from headbench.bench.registry import get
 from headbench.bench.rows import FULL, Rows
-from headbench.reports.aggregate import summarise
-from headbench.reports.coded import coded_labels
+from headbench.reports.aggregate import coded_labels, summarise
 from headbench.reports.curve.curve import CurveData, leaders_text, read_curve
 from headbench.reports.curve.points import HELD_OUT
 from headbench.reports.protocols import choice_effects
@@ -128,8 +127,8 @@ class StoredResults:
         """Means of the suite, as `MeasuredFigures` has them; over all cameras, as papers print them."""
         runs = self.suite
         metrics = [spec for spec in runs.metrics if "comparison" in spec.tables]
-        table = build_table(runs.rows, metrics, runs.ranked, runs.tasks, protocol_ids={})
-        names = [f"{column.task}/{column.metric}".lstrip("/") for column in table.columns]
+        table = build_table(runs.listing(runs.ranked), metrics, runs.tasks)
+        names = [column.name for column in table.columns]
         ((_, rows),) = table.groups
         methods = {row.method: dict(zip(names, (cell.text for cell in row.cells))) for row in rows}
         sizes = {found.resolution for run in runs.runs for found in run.manifest.protocols.values()}

@@ -27,7 +27,7 @@ from ...bench.terminal import table
 from ..aggregate import subject_means
 from ..plots import MARKERS, SMALL, cost_axis, plot_file, show_missing, start_axes
 from ..runs import RunData
-from ..statistics.paired import LEAST_SUBJECTS, interval
+from ..statistics.comparisons import LEAST_SUBJECTS, interval
 from ..writers import csv_text, pipe_table
 from .points import HELD_OUT, MEASURED, CurvePoint, column, mean_point, points_text
 from .settings import CurveReportSettings

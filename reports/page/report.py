@@ -22,15 +22,13 @@ from ...bench.protocol import TASK_TITLES
 from ...bench.rows import FULL
 from ...bench.specs import CommandResult, MetricSpec
 from ..aggregate import summarise
-from ..compact import compact
 from ..drawing import colour_map
-from ..papers import printed_tables
+from ..papers import as_printed, printed_tables
 from ..pareto.points import LATENCY, SIZE, SPEED, pareto_front
-from ..printed import as_printed
 from ..runs import FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import COMPARISON, layouts, table_of
-from ..tables import AVATAR_TITLE, TITLES, Table
+from ..tables import AVATAR_TITLE, TITLES, Table, compact
 from ..writers import render_page
 from .frames import Opening, Pictures, ShownFrame, choose_pictures, frame_values, opening, worst_frames
 from .sections import (

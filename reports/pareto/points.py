@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from ...bench.errors import InputError
 from ...bench.specs import MetricSpec
-from ..aggregate import summarise
-from ..conditions import Conditions, conditions, note_of
+from ..aggregate import Conditions, conditions, note_of, summarise
 from ..runs import RunData, check_same_protocol
 
 

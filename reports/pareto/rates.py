@@ -16,7 +16,7 @@ from ...bench.errors import InputError
 from ...bench.specs import MetricSpec
 from ..aggregate import subject_means, whole_images
 from ..runs import RunData, training_labels
-from ..statistics.paired import LEAST_SUBJECTS, half_width
+from ..statistics.comparisons import LEAST_SUBJECTS, half_width
 from .points import SIZE, pareto_front
 
 Curve = Sequence[tuple[float, float]]

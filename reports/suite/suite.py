@@ -17,8 +17,8 @@ from ...bench.rows import ALL, FULL
 from ..aggregate import means_by_seed, whole_images
 from ..runs import WHOLE, FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
+from ..statistics.comparisons import LEVEL as TEST_LEVEL
 from ..statistics.comparisons import PairedComparison, compare, subjects_needed
-from ..statistics.paired import LEVEL as TEST_LEVEL
 from ..statistics.primary import PAIR, primary_section
 from ..table_report import Columns, table_of
 from ..tables import Column, Table, TableCell, TableRow

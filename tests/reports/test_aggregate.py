@@ -5,7 +5,7 @@ from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
 from headbench.bench.rows import Rows
 from headbench.reports.aggregate import summarise
-from headbench.reports.cameras import explained
+from headbench.reports.runs import explained
 
 
 def keys(subject, cameras):

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.reports.coded import CODED_CHANGE, STORAGE_CODED
+from headbench.reports.aggregate import CODED_CHANGE, STORAGE_CODED
 from headbench.reports.runs import RunSet
 from headbench.reports.table_report import read_runs, table_of
 

@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from headbench.reports.compact import compact
+from headbench.reports.tables import compact
 
 from .conftest import LPIPS, PSNR, SIZE
 from .made_rows import avatar_row, row, table_of

@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 
 from headbench.bench.specs import MetricSpec
-from headbench.reports.conditions import OTHERS_LIMIT
+from headbench.reports.aggregate import OTHERS_LIMIT
 from headbench.reports.writers import WRITERS
 
 from .made_rows import avatar_row, table_of

@@ -5,9 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
-from headbench.bench.rows import Rows
 from headbench.bench.specs import Mechanism, MetricSpec
-from headbench.reports.tables import build_table
 from headbench.reports.writers import to_markdown, to_text
 
 from .made_rows import avatar_row, row, table_of
@@ -59,7 +57,7 @@ def test_a_mechanism_that_is_off_is_named_and_none_is_ranked(make_rows, metrics)
         for method, values in found.items()
         for subject, value in zip("st", values)
     ]
-    table = build_table(Rows.of(rows), [spec], [*found], [], protocol_ids={})
+    table = table_of(pd.DataFrame(rows), [spec], found, [])
     assert table.warnings == ("a: lines off: 3.5 % of the splats change (opacity).",)
     assert {cell.rank for row in table.rows for cell in row.cells} == {None}
     assert table.notes == ("lines: opacity.", "lines left out: opacity.")

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from headbench.bench.errors import InputError
-from headbench.reports.statistics.paired import half_width, interval, paired_differences
+from headbench.reports.statistics.comparisons import half_width, interval, paired_differences
 
 
 @pytest.fixture
