@@ -20,6 +20,8 @@ from ..bench.manifest import Manifest, MethodRecord
 from ..bench.rows import ALL, FRAME, FULL, LEFT_OUT, SUSPECT, Row, Rows
 from ..bench.specs import ACTING, DYNAMIC, OFF, MetricSpec
 
+AVERAGED = "frames, then sequences, then subjects"
+
 
 @dataclass(frozen=True)
 class Aggregate:

@@ -18,9 +18,8 @@ from ..bench.registry import get
 from ..bench.rows import FULL
 from ..bench.specs import CommandResult, MetricSpec
 from ..bench.terminal import table
-from .aggregate import summarise
+from .aggregate import AVERAGED, summarise
 from .runs import RunSet, synthetic_settings, unseen_cameras
-from .tables import AVERAGED
 from .writers import pipe_table
 
 QUALITY = {"psnr": 2, "lpips": 4}

@@ -17,11 +17,10 @@ from ..bench.engine.store import FinishedRun, RunFolder
 from ..bench.errors import InputError
 from ..bench.manifest import ClipRecord, Manifest, MethodRecord, cut_of
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, joined_protocol, missing_tasks
+from ..bench.registry import is_outside
 from ..bench.rows import ALL, FULL, Rows
-from ..bench.source import is_outside
 from ..bench.specs import MetricSpec
-from .aggregate import check_codecs, with_coded
-from .tables import AVERAGED
+from .aggregate import AVERAGED, check_codecs, with_coded
 
 SPLIT_TASK = "self_reenactment"
 """Scored at all cameras, of which most have training frames. Values at those and at held-out cameras differ by several dB, so
@@ -214,15 +213,12 @@ class RunSet:
 
     @classmethod
     def joined(cls, runs: tuple[RunData, ...]) -> RunSet:
-        """Combine loaded runs, with one protocol and new labels; see `read`."""
-        return cls.of_runs(_with_one_protocol(runs), training_labels(runs))
-
-    @classmethod
-    def of_runs(cls, runs: tuple[RunData, ...], labels: Sequence[Mapping[str, str]]) -> RunSet:
-        """Combine loaded runs, with given labels of each run's methods. Raises `InputError` as `read` does.
+        """Combine loaded runs, with one protocol and new labels; see `read`.
 
         Coded avatars are columns of their methods, see `with_coded`.
         """
+        runs = _with_one_protocol(runs)
+        labels = training_labels(runs)
         if runs:
             check_codecs([run.manifest for run in runs], runs[0].folder.manifest)
         changed = [with_coded(run.manifest, run.rows) for run in runs]
@@ -328,25 +324,10 @@ class RunSet:
         return ids | dict.fromkeys((SEEN_CAMERAS, UNSEEN_CAMERAS), ids.get(SPLIT_TASK, ""))
 
     @property
-    def unchecked(self) -> tuple[str, ...]:
-        """A sentence if captures were not searched for errors before a run."""
-        said = "The captures were not searched for errors before the run (--unchecked)."
-        return (said,) if any(run.manifest.unchecked for run in self.runs) else ()
-
-    @property
     def with_refit(self) -> tuple[str, ...]:
         """Labels under conditions that score frames from other views than those of the capture's tracking."""
         changed = {c.name for run in self.runs for c in run.manifest.configuration.conditions if c.views}
         return tuple(label for label, record in self.records.items() if record.condition in changed)
-
-    @property
-    def refitted(self) -> tuple[str, ...]:
-        """A sentence on `with_refit`."""
-        labels = self.with_refit
-        said = (
-            "each scored frame was fitted to its own picture (camera, jaw, expression) with the avatar frozen"
-        )
-        return (f"{', '.join(labels)}: {said}; not comparable with values of tracked frames.",) * bool(labels)
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -356,17 +337,23 @@ class RunSet:
         return tuple(missing_tasks([*asked], done).values())
 
     @property
-    def mixed_code(self) -> tuple[str, ...]:
-        """A sentence on methods of this package whose code, but not version, changed between the runs."""
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on methods of this package whose code, but not version, changed between the runs, on captures that were
+        not searched for errors, and on `with_refit`."""
         codes: dict[str, set[str]] = {}
-        for run in self.runs:
-            for record in run.manifest.methods:
-                if record.code and not is_outside(record.implementation):
-                    codes.setdefault(f"{record.name} (version {record.version})", set()).add(record.code)
-        changed = [name for name, found in codes.items() if len(found) > 1]
-        return (
-            f"Files of these methods changed between the runs, although their version did not: {', '.join(changed)}.",
-        ) * bool(changed)
+        for record in (record for run in self.runs for record in run.manifest.methods):
+            if record.code and not is_outside(record.implementation):
+                codes.setdefault(f"{record.name} (version {record.version})", set()).add(record.code)
+        remarks = []
+        if changed := [name for name, digests in codes.items() if len(digests) > 1]:
+            what = "Files of these methods changed between the runs, although their version did not"
+            remarks.append(f"{what}: {', '.join(changed)}.")
+        if any(run.manifest.unchecked for run in self.runs):
+            remarks.append("The captures were not searched for errors before the run (--unchecked).")
+        if refitted := ", ".join(self.with_refit):
+            how = "each scored frame was fitted to its own picture (camera, jaw, expression) with the avatar frozen"
+            remarks.append(f"{refitted}: {how}; not comparable with values of tracked frames.")
+        return tuple(remarks)
 
     @property
     def cut(self) -> str:

@@ -235,12 +235,7 @@ def table_of(
         runs,
         metrics,
         tasks,
-        missing=(
-            *(runs.missing if tasks == runs.tasks else ()),
-            *runs.mixed_code,
-            *runs.unchecked,
-            *runs.refitted,
-        ),
+        missing=(*(runs.missing if tasks == runs.tasks else ()), *runs.remarks),
         avatar_title=TITLES.get(layout, AVATAR_TITLE),
         name=layout,
     )

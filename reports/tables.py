@@ -18,6 +18,7 @@ from ..bench.protocol import TASK_TITLES
 from ..bench.rows import ALL, FULL, Rows
 from ..bench.specs import DYNAMIC, MetricSpec
 from .aggregate import (
+    AVERAGED,
     CODED_CHANGE,
     Aggregate,
     conditions,
@@ -105,9 +106,6 @@ class TaskSummary:
     def size(self) -> str:
         """Amount of data in words."""
         return f"{counted(self.frames, 'frame')}, {counted(self.subjects, 'subject')}"
-
-
-AVERAGED = "frames, then sequences, then subjects"
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from ..configuration import build, build_arguments, deciding_settings, merge, se
 from ..contracts import Budget, TaskName
 from ..errors import InputError
 from ..io.files import check_name, check_utf8
-from ..registry import discover, get, resolve, unknown
-from ..source import code_digest, forget_code, is_outside
+from ..registry import discover, get, is_outside, resolve, unknown
+from ..source import code_digest, forget_code
 from ..specs import ConditionSpec, MethodSpec, MetricSpec, ProfileSpec
 
 CANONICAL = "canonical"
