@@ -96,6 +96,14 @@ def build_folder(cls: type[T], folder: Path) -> dict[str, T]:
     return {path.stem: build_file(cls, path) for path in sorted(folder.glob("*.yaml"))}
 
 
+def build_named(cls: type[T], folder: Path, name: str, option: str) -> T:
+    """Build ``cls`` from the YAML file of a name. Raises `InputError` for an unknown one, naming the option, and as `build` does."""
+    names = [path.stem for path in folder.glob("*.yaml")]
+    if name not in names:
+        raise unknown("command line", option, name, names)
+    return build_file(cls, folder / f"{name}.yaml")
+
+
 def build_file(cls: type[T], path: Path) -> T:
     """Build ``cls`` from a YAML file. Raises `InputError` as `build` does."""
     return build(cls, read_yaml(path), str(path))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import logging
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -18,10 +17,10 @@ from .contracts import FrameKey
 from .engine.config import RunConfig
 from .errors import InputError
 from .io.documents import checked, read_json, shown
-from .io.files import check_name, digest, to_jsonable, write_json, write_text
+from .io.files import digest, to_jsonable, write_json, write_text
 from .progress import counted
 from .protocol import Protocol
-from .specs import LABEL, MetricSpec, is_label
+from .specs import MetricSpec
 
 log = logging.getLogger(__name__)
 
@@ -133,7 +132,6 @@ def protocol_path(folder: Path, protocol: str) -> Path:
 
 def _read_protocol(run: Path, task: str, name: str) -> ProtocolRecord:
     """Read the protocol with the hash ``name``. Raises `InputError` if it is not in the run folder."""
-    check_name(name, run, f"protocols.{task}")
     path = protocol_path(run.parent, name)
     if not path.exists():
         expected = f"the protocol of {task} that {run.name} names"
@@ -141,11 +139,6 @@ def _read_protocol(run: Path, task: str, name: str) -> ProtocolRecord:
     record = checked(read_json(path), ProtocolRecord, path)
     if (record.task, record.hash) != (task.partition("@")[0], name):
         raise InputError(path, "task, hash", f"{task}, {name}", f"{record.task}, {record.hash}")
-    names = {part for key in record.keys for part in (key.subject, *key.sequence.split("/"), key.camera)}
-    for part in sorted(names):  # a slash separates a driving subject and its sequence
-        check_name(part, path, "keys")
-    if not is_label(record.id):
-        raise InputError(path, "id", LABEL, repr(record.id))
     return record
 
 
@@ -224,48 +217,15 @@ class Manifest:
 
     @classmethod
     def read(cls, path: Path) -> Manifest:
-        """Read ``run.json`` and its protocols. Raises `InputError` naming what is missing, unknown or of the wrong type.
-
-        Names used in paths are checked as by `check_name`.
-        """
+        """Read ``run.json`` and its protocols. Raises `InputError` naming what is missing, unknown or of the wrong type."""
         record = read_json(path)
         if record.get("format") != 3:
             raise InputError(path, "format", "3", shown(record.get("format")), OLD)
         hashes = checked(record.get(PROTOCOLS), dict[str, str], path, PROTOCOLS)
         manifest = checked({**record, PROTOCOLS: {}}, cls, path)
-        named: dict[str, set[str]] = {
-            "methods": {method.label for method in manifest.methods},
-            "metrics, tables": {table for metric in manifest.metrics for table in metric.tables},
-            "clips": {clip.subject for clip in manifest.clips},
-            PROTOCOLS: set(hashes),
-        }
-        for key, names in named.items():
-            for name in sorted(names):
-                check_name(name, path, key)
-        for key, texts in manifest._printed().items():
-            for text in texts:
-                if not is_label(text):
-                    raise InputError(path, key, LABEL, repr(text))
-        labels = {
-            "methods": [m.label for m in manifest.methods],
-            "metrics": [m.name for m in manifest.metrics],
-        }
-        for key, names_of in labels.items():
-            count = Counter(names_of)
-            twice = [name for name, number in count.items() if number > 1]
-            if twice:
-                raise InputError(path, key, "each name once", ", ".join(twice))
         return replace(
             manifest, protocols={task: _read_protocol(path, task, name) for task, name in hashes.items()}
         )
-
-    def _printed(self) -> dict[str, list[str]]:
-        """Descriptions printed next to names in tables and errors, by key."""
-        return {
-            "methods, version": [method.version for method in self.methods],
-            "clips, fingerprint": [clip.fingerprint for clip in self.clips],
-            "machine, processor": [str(self.machine.get("processor", ""))],
-        }
 
     def write(self, path: Path) -> None:
         """Write the protocols and ``run.json``, each file atomically."""

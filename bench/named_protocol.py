@@ -12,10 +12,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from .configuration import build_folder
+from .configuration import build_folder, build_named
 from .contracts import Clip, TaskName
 from .errors import InputError
-from .registry import unknown
 
 FOLDER = Path(__file__).with_name("protocols")
 
@@ -110,11 +109,10 @@ def named_protocols() -> dict[str, NamedProtocol]:
     return build_folder(NamedProtocol, FOLDER)
 
 
+@cache
 def protocol_named(name: str) -> NamedProtocol:
     """Look up a protocol. Raises `InputError` for an unknown one."""
-    if name not in named_protocols():
-        raise unknown("command line", "--protocol", name, named_protocols())
-    return named_protocols()[name]
+    return build_named(NamedProtocol, FOLDER, name, "--protocol")
 
 
 def needed(names: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:

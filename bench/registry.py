@@ -93,6 +93,11 @@ def get(group: Group, name: str) -> Any:
     return plugin.spec
 
 
+def is_outside(reference: str) -> bool:
+    """Whether ``"package.module:Object"`` names an object outside this package."""
+    return bool(reference) and reference.partition(":")[0].partition(".")[0] != _OWN
+
+
 def resolve(reference: str) -> Any:
     """Import ``"package.module:attribute"``."""
     module_name, _, attribute = reference.partition(":")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from enum import Enum
@@ -15,19 +14,18 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from .condition import label_of
 from .contracts import IntArray
 from .errors import InputError, shortened
 from .io.files import atomic_path, open_regular, reading
-from .specs import LABEL, is_label
 
 log = logging.getLogger(__name__)
 FRAME = ["subject", "sequence", "timestep", "camera"]
 """Columns that name a frame."""
-STATUSES = ("ok", "missing", "failed")
+FULL = "full"
+"""The region over which every metric is computed: the whole frame."""
 SUSPECT = "suspect: "
 """Prefix of the reason of a measured value that is suspiciously good, see `MetricSpec.suspect_above`."""
 
@@ -67,8 +65,6 @@ LEFT_OUT = "left out: "
 """Prefix of the reason of a missing value that is left out, see `LeftOutError`."""
 
 COLUMNS = tuple(f.name for f in fields(Row))
-WHOLE, NUMBERS = ("seed", "timestep", "threads"), ("seed", "timestep", "value", "threads", "other_cores")
-TEXTS = tuple(name for name in COLUMNS if name not in NUMBERS)
 TYPES = {
     "seed": "int64",
     "timestep": "int64",
@@ -76,12 +72,11 @@ TYPES = {
     "threads": "int64",
     "other_cores": "float64",
 }
+TEXTS = tuple(name for name in COLUMNS if name not in TYPES)
 
 ROWS = "a Parquet file of rows"
 JOINED_AT_ONCE = 64
 """Number of tables concatenated at a time: many small tables take many times the memory of their content."""
-MAX_VALUE = 1e15
-"""Largest measured value, which bounds sums and their text."""
 MAX_REASON = 4_000
 """Maximum characters of a reason; longer ones are shortened in the middle."""
 
@@ -125,16 +120,19 @@ class Rows:
 
     @classmethod
     def read(cls, path: Path) -> Rows:
-        """Read rows.
-
-        Raises `InputError` for a file that is missing, not Parquet as `write` leaves it, or too large; and for a missing
-        column or one of another type, an empty entry, an unknown status, or a measured value that is not finite.
-        """
+        """Read rows that `write` wrote. Raises `InputError` for a file that is missing, not Parquet, or lacks a column."""
         if not path.exists():
             raise InputError(path, "", "the rows of a finished run", "no such file", "Start the run again.")
-        with reading(path, ROWS):
-            table = _read_table(path)
-        return cls(_checked(table, path))
+        with open_regular(path, ROWS) as stream, reading(path, ROWS):
+            if lacking := sorted({*COLUMNS} - {*pq.read_schema(stream).names}):
+                raise InputError(path, "columns", ", ".join(COLUMNS), f"no {', '.join(lacking)}")
+            # Text as dictionaries, so that repeated text takes no memory.
+            file = pq.ParquetFile(stream, read_dictionary=list(TEXTS), pre_buffer=False)
+            table = file.read(columns=list(COLUMNS), use_threads=False, use_pandas_metadata=False)
+            columns = {name: table.column(name).combine_chunks() for name in COLUMNS}
+            texts = {name: _texts(columns.pop(name), name) for name in TEXTS}
+            numbers = {name: column.to_numpy(zero_copy_only=False) for name, column in columns.items()}
+            return cls(pd.DataFrame(numbers | texts, columns=list(COLUMNS)).astype(TYPES))
 
     def write(self, path: Path) -> None:
         """Write the rows as Parquet, atomically."""
@@ -234,18 +232,13 @@ class Rows:
 
     def frames(self, task: str, region: str) -> set[tuple[str, str, int, str]]:
         """Frames of a task for which any method has a row in a region."""
-        if (task, region) not in self._frames:
-            self._frames[task, region] = self._sought_frames(task, region)
-        return self._frames[task, region]
+        return set(self._frames.get((task, region), ()))
 
     @cached_property
-    def _frames(self) -> dict[tuple[str, str], set[tuple[str, str, int, str]]]:
-        return {}
-
-    def _sought_frames(self, task: str, region: str) -> set[tuple[str, str, int, str]]:
-        own = self.select(method=ALL, condition=ALL, metric=ALL, task=task, region=region, seeds=ALL)
-        own = own[own["timestep"] >= 0]
-        return set(own[FRAME].drop_duplicates().itertuples(index=False, name=None))
+    def _frames(self) -> dict[tuple[str, str], list[tuple[str, str, int, str]]]:
+        table = self._table[self._table["timestep"] >= 0]
+        groups = table[["task", "region", *FRAME]].drop_duplicates().groupby(["task", "region"])[FRAME]
+        return {place: list(own.itertuples(index=False, name=None)) for place, own in groups}  # type: ignore[misc]
 
     def renamed(self, labels: Mapping[str, str]) -> Rows:
         """Return the rows with methods renamed."""
@@ -414,47 +407,6 @@ class Rows:
         return self.select(method=method, condition=ALL, metric=ALL, task=ALL, region=ALL, seeds=ALL)
 
 
-def _read_table(path: Path) -> pa.Table:
-    """Read the columns of `Row`; text as dictionaries, so that repeated text takes no memory."""
-    with open_regular(path, ROWS) as stream:
-        names = Counter(pq.read_schema(stream).names)
-        wrong = [f"{names[name] or 'no'} {name}" for name in COLUMNS if names[name] != 1]
-        if wrong:
-            raise InputError(path, "columns", f"once each {', '.join(COLUMNS)}", ", ".join(wrong))
-        file = pq.ParquetFile(stream, read_dictionary=list(TEXTS), pre_buffer=False)
-        table = file.read(columns=list(COLUMNS), use_threads=False, use_pandas_metadata=False)
-        table.validate(full=True)
-        return table
-
-
-def _checked(table: pa.Table, path: Path) -> pd.DataFrame:
-    """Check the columns and convert them to the types of `Rows.of`."""
-    columns: dict[str, Any] = {}
-    for name in table.column_names:
-        column = table.column(name).combine_chunks()
-        expected = "whole numbers" if name in WHOLE else "numbers" if name in NUMBERS else "text"
-        known = pa.types.is_int64 if name in WHOLE else pa.types.is_float64 if name in NUMBERS else _is_text
-        if not known(column.type) and not (pa.types.is_null(column.type) and not len(column)):
-            raise InputError(path, name, expected, f"{column.type}")
-        if name not in ("value", "other_cores") and column.null_count:
-            raise InputError(path, name, f"{expected} in every row", f"{column.null_count} empty entries")
-        columns[name] = _texts(column, path, name) if name in TEXTS else column.to_numpy(zero_copy_only=False)
-    frame = pd.DataFrame(columns).astype(TYPES)
-    strange = sorted({*frame["status"].unique()} - {*STATUSES})
-    if strange:
-        raise InputError(path, "status", f"one of {', '.join(STATUSES)}", ", ".join(map(repr, strange)))
-    undefined = frame[(frame["status"] == "ok") & ~(frame["value"].abs() <= MAX_VALUE)]
-    if len(undefined):
-        first = undefined.iloc[0]
-        where = f"{first['metric']} of {first['method']}, {first['subject']} {first['timestep']}"
-        raise InputError(path, where, f"a finite value of at most {MAX_VALUE:g}", str(first["value"]))
-    for name in ("threads", "other_cores"):
-        wrong = frame.loc[(frame[name] < 0) | np.isinf(frame[name]), name]
-        if len(wrong):
-            raise InputError(path, name, "a number from 0", str(wrong.iloc[0]))
-    return frame
-
-
 def _mapped(words: pd.Series[str], change: Callable[[str], str]) -> pd.Series[str]:
     """Apply ``change`` to every word, once for each distinct word."""
     place, known = pd.factorize(words)
@@ -462,20 +414,11 @@ def _mapped(words: pd.Series[str], change: Callable[[str], str]) -> pd.Series[st
     return pd.Series(changed, words.index, dtype="str")
 
 
-def _is_text(kind: pa.DataType) -> bool:
-    return pa.types.is_dictionary(kind) and (
-        pa.types.is_string(kind.value_type) or pa.types.is_large_string(kind.value_type)
-    )
-
-
-def _texts(column: Any, path: Path, name: str) -> pd.Series[str]:
-    """Text of every row; reasons shortened, without control characters."""
+def _texts(column: Any, name: str) -> pd.Series[str]:
+    """Text of every row of a dictionary column; reasons, which may be of plug-ins, shortened and without control characters."""
     if not len(column):
         return pd.Series([], dtype="str")
-    words = [str(word) for word in column.dictionary.to_pylist()]
+    words = column.dictionary.to_pylist()
     if name == "reason":
         words = [shortened(word, MAX_REASON) for word in words]
-    for word in words:
-        if name != "reason" and not is_label(word):
-            raise InputError(path, name, LABEL, repr(word))
     return pd.Series(np.array(words, dtype=object)[column.indices.to_numpy()], dtype="str")

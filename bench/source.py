@@ -11,14 +11,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
-from .registry import resolve
-
-_OWN = __name__.partition(".")[0]
-
-
-def is_outside(reference: str) -> bool:
-    """Whether ``"package.module:Object"`` names an object outside this package."""
-    return bool(reference) and reference.partition(":")[0].partition(".")[0] != _OWN
+from .registry import is_outside, resolve
 
 
 @cache

@@ -284,6 +284,11 @@ class MetricSpec:
         """Whether every frame has a value; otherwise the avatar has one."""
         return self.kind in ("frame", "regional", "temporal", "sequence")
 
+    @property
+    def is_speed(self) -> bool:
+        """Whether concurrent jobs on the machine would bias it, a metric of an avatar."""
+        return self.machine_bound and self.kind == "avatar"
+
     def __post_init__(self) -> None:
         """Refuse values that tables cannot show or results cannot be read with."""
         _check_labels(name=self.name, label=self.label, unit=self.unit)

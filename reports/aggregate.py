@@ -1,15 +1,26 @@
-"""Aggregates rows to one number per method, task and metric, or the reason why it is missing."""
+"""From rows to the numbers of tables: means, columns of coded avatars, and remarks on what cannot be compared.
+
+A number of a method, task and metric is a mean over frames, sequences, subjects and seeds, or the reason why it is missing.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import fmean, stdev
 from typing import Literal
 
 import pandas as pd
 
-from ..bench.engine.scoring import FULL
-from ..bench.rows import ALL, FRAME, LEFT_OUT, Rows
+from ..bench.engine.config import CODED
+from ..bench.errors import InputError
+from ..bench.manifest import Manifest, MethodRecord
+from ..bench.rows import ALL, FRAME, FULL, LEFT_OUT, SUSPECT, Row, Rows
+from ..bench.specs import ACTING, DYNAMIC, OFF, MetricSpec
+
+AVERAGED = "frames, then sequences, then subjects"
 
 
 @dataclass(frozen=True)
@@ -104,3 +115,263 @@ def _reason(rows: pd.DataFrame) -> str:
         " ".join(str(first["reason"]).split())
         or f"The rows have the status {first['status']} without a reason."
     )
+
+
+OTHERS_LIMIT = 0.1
+"""Times are marked if other processes used more than this number of cores in total.
+
+If one core is busy with other processes for a tenth of the time, a frame with synchronised threads takes at most a tenth
+longer.
+Consecutive measurements on an idle machine differ by as much.
+"""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions under which the times of one method were measured.
+
+    Attributes
+    ----------
+    places : frozenset[tuple[str, int]]
+        Pairs of machine and number of threads; empty if they were not recorded.
+    others : float
+        Maximum number of cores used by other processes, 0 if no load was recorded.
+    known : bool
+        Whether the load was recorded for all of them.
+    """
+
+    places: frozenset[tuple[str, int]]
+    others: float
+    known: bool
+
+    @classmethod
+    def of(cls, rows: pd.DataFrame) -> Conditions:
+        """Conditions of measured rows, at least one."""
+        recorded = rows[rows["threads"] > 0]
+        places = frozenset((str(m), int(t)) for m, t in zip(recorded["machine"], recorded["threads"]))
+        others = rows["other_cores"].astype(float).dropna()
+        return cls(places, float(others.max()) if len(others) else 0.0, len(others) == len(rows))
+
+    @property
+    def loaded(self) -> bool:
+        """Whether other processes used more than `OTHERS_LIMIT`."""
+        return self.others > OTHERS_LIMIT
+
+    @property
+    def text(self) -> str:
+        """Machines and threads as text; "" if they were not recorded."""
+        return "; ".join(
+            f"{machine} with {threads} thread{'s' * (threads > 1)}"
+            for machine, threads in sorted(self.places)
+        )
+
+
+def conditions(
+    rows: Rows, metrics: Sequence[MetricSpec], methods: Sequence[str]
+) -> dict[str, dict[str, Conditions]]:
+    """Conditions of each machine-dependent metric, by metric and method, for methods with a value."""
+    found: dict[str, dict[str, Conditions]] = {}
+    for metric in metrics:
+        if metric.machine_bound and not metric.per_frame:
+            own = {method: whole_images(rows, method, metric.name, "") for method in methods}
+            measured = {method: table[table["status"] == "ok"] for method, table in own.items()}
+            found[metric.name] = {m: Conditions.of(table) for m, table in measured.items() if len(table)}
+    return found
+
+
+def marks(
+    found: Mapping[str, Mapping[str, Conditions]], trivial: Sequence[str]
+) -> dict[tuple[str, str], str]:
+    """The note for each metric and method whose time is not comparable with the others of its column.
+
+    The note states the highest load in the column, so that its methods share a note.
+    """
+    notes = {}
+    for metric, by_method in found.items():
+        places = [each.places for method, each in by_method.items() if method not in trivial and each.places]
+        differ = len(set(places)) > 1
+        most = max((each.others for each in by_method.values()), default=0.0)
+        for method, each in by_method.items():
+            note = []
+            if each.loaded:
+                note.append(f"Measured under load: other processes used up to {most:.2f} cores.")
+            if differ and each.places and method not in trivial:
+                note.append(f"Measured on {each.text}; not comparable with other machines or thread counts.")
+            if note:
+                notes[metric, method] = " ".join(note)
+    return notes
+
+
+def suspects(rows: Rows, methods: Sequence[str]) -> dict[tuple[str, str, str], str]:
+    """The note for each metric, method and task with values that are marked as suspect in their rows."""
+    notes = {}
+    for method in methods:
+        own = rows.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+        own = own[(own["status"] == "ok") & own["reason"].str.startswith(SUSPECT)]
+        for (metric, task), found in own.groupby(["metric", "task"]):
+            why = str(found["reason"].iloc[0]).removeprefix(SUSPECT)
+            notes[str(metric), method, str(task)] = (
+                f"Suspect, not ranked: {len(found)} frames are {why}, which a method that has not seen them cannot reach."
+            )
+    return notes
+
+
+def mechanisms(rows: Rows, methods: Sequence[str]) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Note on the mechanism of each method by label, and a sentence on each one that is off, see `Mechanism`."""
+    notes, off = {}, []
+    for method in methods:
+        value = summarise(rows, method, DYNAMIC, "").value
+        own = rows.select(method=method, metric=DYNAMIC, task="", region=ALL, seeds=ALL)
+        reasons = list(filter(None, map(str, own["reason"])))
+        name, _, meaning = "".join(reasons[:1]).partition(": ")
+        if value is None or not meaning:
+            continue
+        name = name.removesuffix(OFF)
+        notes[method] = f"{name}: {meaning}."
+        if value < ACTING and any(f"{OFF}: " in reason for reason in reasons):
+            off.append(f"{method}: {name}{OFF}: {value:.1f} % of the splats change ({meaning}).")
+    return notes, tuple(off)
+
+
+def note_of(by_method: Mapping[str, Conditions]) -> str:
+    """One line on methods whose times are not comparable, by `marks`; "" if all are comparable."""
+    methods: dict[str, list[str]] = {}
+    for (_, method), note in marks({"": by_method}, ()).items():
+        methods.setdefault(note, []).append(method)
+    return " ".join(f"{', '.join(names)}: {note}" for note, names in methods.items())
+
+
+def measured_on(by_method: Mapping[str, Conditions], trivial: Sequence[str], machine: str) -> str:
+    """Machines and threads of the compared methods; ``machine`` if they were not recorded."""
+    compared = {method: each for method, each in by_method.items() if method not in trivial} or by_method
+    texts: dict[str, None] = {}
+    for each in compared.values():
+        if text := each.text or machine:
+            texts[text if each.known else f"{text}, load not recorded"] = None
+    return "; ".join(texts)
+
+
+STORAGE, QUALITY = "storage", "psnr"
+TASKS = ("novel_view", "self_reenactment")
+NO_FRAMES = "The run has frames of neither task."
+STORAGE_CODED = MetricSpec(
+    name="storage_coded",
+    label="Coded",
+    unit="MB",
+    higher_is_better=False,
+    digits=2,
+    implementation="headbench.reports.aggregate:with_coded",
+    summary="Bytes of the files through the codec of all methods, SI megabytes.",
+    kind="avatar",
+    tables=("comparison", "cost"),
+)
+CODED_CHANGE = MetricSpec(
+    name="coded_change",
+    label="By coding",
+    unit="dB",
+    higher_is_better=True,
+    digits=2,
+    implementation="headbench.reports.aggregate:with_coded",
+    summary="PSNR of the coded avatar minus that of the trained one, on the same frames; the lower one of the tasks' means.",
+    kind="avatar",
+    tables=("comparison", "cost"),
+)
+
+
+def with_coded(manifest: Manifest, rows: Rows) -> tuple[Manifest, Rows]:
+    """Convert cells of the condition `CODED` to values of `STORAGE_CODED` and `CODED_CHANGE` of the plain methods.
+
+    A run without this condition, or one that is derived from another run, is not changed.
+    """
+    labels = coded_labels(manifest)
+    if not labels:
+        return manifest, rows
+    records = [record for record in manifest.methods if record.label not in labels.values()]
+    more = [row for record in records if not record.condition for row in _coded_rows(rows, record, labels)]
+    kept = rows.of_methods([record.label for record in records])
+    metrics = list(manifest.metrics)
+    place = next((i + 1 for i, metric in enumerate(metrics) if metric.name == STORAGE), len(metrics))
+    metrics[place:place] = [STORAGE_CODED, CODED_CHANGE]
+    manifest = replace(manifest, methods=tuple(records), metrics=tuple(metrics))
+    return manifest, Rows.joined([kept, Rows.of(more)])
+
+
+def coded_labels(manifest: Manifest) -> dict[str, str]:
+    """Label of the coded avatars by the method's name; empty for a run that is derived from another one."""
+    if manifest.configuration.source:
+        return {}
+    return {record.name: record.label for record in manifest.methods if record.condition == CODED}
+
+
+def check_codecs(manifests: Sequence[Manifest], file: Path) -> None:
+    """Refuse runs whose methods use different codecs.
+
+    Plain methods must have files as trained, without a codec, and all coded ones the same codec with
+    the same steps. Runs that did not record codecs are accepted. Raises `InputError`, naming ``file``.
+    """
+    trained: dict[str, str] = {}
+    coded: dict[str, str] = {}
+    for manifest in manifests:
+        labels = coded_labels(manifest).values()
+        for record in manifest.methods:
+            found = coded if record.label in labels else trained
+            if record.codec is not None and (found is coded or not record.condition):
+                found |= dict.fromkeys(record.codec.split("; "), record.label)
+    for kind, found, expected in (
+        ("trained", trained, "files as trained, without a codec"),
+        ("coded", coded, "one codec with one set of steps for all methods"),
+    ):
+        if found and (set(found) != {""} if found is trained else len(found) > 1 or "" in found):
+            text = "; ".join(f"codec {codec or 'none'} ({label})" for codec, label in sorted(found.items()))
+            remedy = "Sizes from different codecs are not comparable; code all avatars with one codec."
+            raise InputError(file, f"methods, codec of {kind} avatars", expected, text, remedy)
+
+
+def _coded_rows(rows: Rows, record: MethodRecord, labels: Mapping[str, str]) -> list[Row]:
+    """Rows of both metrics of a plain method, by subject and seed."""
+    coded, result = labels.get(record.name), []
+    for seed in sorted(rows.seeds(record.label)):
+        for subject in sorted(rows.subjects):
+            place = subject, seed
+            size = _mean_or_reason(rows, coded, STORAGE, "", *place)
+            changes = [
+                _change_by_coding(rows, record.label, coded, task, *place)
+                for task in TASKS
+                if task in rows.tasks
+            ]
+            # Missing ones first: the minimum over one task would hide that the other is unknown.
+            change = min(
+                changes, key=lambda each: (math.isfinite(each[0]), each[0]), default=(math.nan, NO_FRAMES)
+            )
+            for spec, (value, reason) in ((STORAGE_CODED, size), (CODED_CHANGE, change)):
+                row = Row(
+                    *(record.label, record.version, seed, "", subject, "", -1, "", FULL, spec.name),
+                    *(value, "", "ok" if math.isfinite(value) else "missing", reason),
+                )
+                result.append(row)
+    return result
+
+
+def _change_by_coding(
+    rows: Rows, label: str, coded: str | None, task: str, subject: str, seed: int
+) -> tuple[float, str]:
+    """Change of `QUALITY` in a task by the codec and "", or NaN and the reason."""
+    before, after = (_mean_or_reason(rows, of, QUALITY, task, subject, seed) for of in (label, coded))
+    return after[0] - before[0], after[1] or before[1]
+
+
+def _mean_or_reason(
+    rows: Rows, label: str | None, metric: str, task: str, subject: str, seed: int
+) -> tuple[float, str]:
+    """Mean of one metric of one avatar, over frames and sequences, and "", or NaN and the reason."""
+    if label is None:
+        return math.nan, "The method has no coded avatar."
+    own = rows.select(method=label, metric=metric, task=task, region=FULL, seeds=(seed,), subject=subject)
+    if own.empty:
+        failed = rows.select(method=label, metric=ALL, task=ALL, region=ALL, seeds=(seed,), subject=subject)
+        reasons = [str(reason) for reason in failed["reason"] if reason]
+        return math.nan, reasons[0] if reasons else f"The run did not measure {metric} of the coded avatar."
+    missing = own[own["status"] != "ok"]
+    if len(missing):
+        return math.nan, str(missing.iloc[0]["reason"])
+    return next(iter(subject_means(own).values())), ""

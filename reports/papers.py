@@ -1,20 +1,25 @@
-"""Published tables of papers as data, one file per paper in `published`. Light to import: without pandas."""
+"""Published tables of papers as data, one file per paper in `published`, and measured tables in their form.
+
+Light to import: without pandas.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..bench.configuration import build_folder
+from ..bench.configuration import build_folder, build_named
 from ..bench.errors import InputError
-from ..bench.registry import unknown
+from ..bench.specs import MetricKind, MetricSpec
 
 if TYPE_CHECKING:
     from ..bench.manifest import MethodRecord
+    from .runs import RunSet
+    from .tables import Table, TableCell
 
 FOLDER = Path(__file__).with_name("published")
 
@@ -36,7 +41,7 @@ OF_FRAMES = {
 OF_AVATARS = {
     "storage": ("Storage", "MB", False),
     "fps": ("Speed", "FPS", True),
-    "training_time": ("Training", "s", False),
+    "training_time": ("Training", "min", False),
 }
 """Metrics in papers: label, unit, and whether higher values are better; first those of a task, then the others."""
 
@@ -170,11 +175,10 @@ def papers() -> dict[str, Paper]:
     return build_folder(Paper, FOLDER)
 
 
+@cache
 def paper_named(name: str) -> Paper:
     """Look up a paper. Raises `InputError` for an unknown one."""
-    if name not in papers():
-        raise unknown("command line", "--as", name, papers())
-    return papers()[name]
+    return build_named(Paper, FOLDER, name, "--as")
 
 
 def printed_tables(name: str, number: str | None) -> tuple[PrintedTable, ...]:
@@ -186,6 +190,80 @@ def printed_tables(name: str, number: str | None) -> tuple[PrintedTable, ...]:
         option, given = ("--as", name) if number is None else ("--table", number)
         raise InputError("command line", option, f"a table of {name}: {offered}", given)
     return tuple(found)
+
+
+def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
+    """A table with the columns of a published one: measured methods, then the published rows, which are not ranked.
+
+    Values are means over all cameras, as in papers. Methods have the names used in the paper. Of conditions, those are
+    shown that are a row of the table by their settings alone. Raises `InputError` if the runs have no task of the table.
+    """
+    from ..bench.protocol import TASK_TITLES
+    from .tables import TableRow, build_table
+
+    metrics = _metrics(runs, printed)
+    asked = {key.rpartition("/")[0] for key in printed.keys} - {""}
+    tasks = [task for task in TASKS if task in asked and task in runs.tasks]
+    if asked and not tasks:
+        raise InputError(runs.runs[0].folder.root, "tasks", " or ".join(sorted(asked)), ", ".join(runs.tasks))
+    names = {label: _name(runs.records[label], label, printed) for label in _measured(runs, printed)}
+    name_of_table = f"{name}-{printed.number}"
+    measured = build_table(runs.listing([*names]), metrics, tasks, name=name_of_table)
+    measured = measured.mapped(lambda row: replace(row, method=names[row.method]))
+    rows = tuple(TableRow(row.name, "", True, _cells(row, measured)) for row in printed.rows)
+    title = f"Printed in {printed.table} of the paper (not comparable): {printed.data}"
+    absent = [TASK_TITLES[task] for task in TASKS if task in asked and task not in tasks]
+    missing = [f"{task} is printed, but not measured here." for task in absent]
+    said = (
+        f"Printed values: {paper_named(name).citation}.",
+        f"Their conditions: {printed.conditions}. Read in: {printed.read} (grade {printed.grade}).",
+    )
+    return replace(
+        measured,
+        groups=(*measured.groups, (title, rows)),
+        missing=(*measured.missing, *missing),
+        printed=said,
+    )
+
+
+def _measured(runs: RunSet, printed: PrintedTable) -> list[str]:
+    """Labels of the ranked methods, and of conditions whose changed settings, and nothing else, make them a row of the table."""
+    known = {c.name: c for run in runs.runs for c in run.manifest.configuration.conditions}
+    chosen = {*runs.ranked}
+    for row in printed.rows:
+        own = {label for label, record in runs.records.items() if row.is_of(record)}
+        if own.isdisjoint(runs.ranked):
+            chosen |= {label for label in own if known[runs.records[label].condition].changes_settings_alone}
+    return [label for label in runs.methods if label in chosen]
+
+
+def _metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
+    """The metrics of a published table with its decimals, even if the runs lack them."""
+    known = {spec.name: spec for spec in runs.metrics}
+    used = {key.rpartition("/")[2]: bool(key.rpartition("/")[0]) for key in printed.keys}
+    found = []
+    for metric, of_frames in used.items():
+        label, unit, higher = (OF_FRAMES if of_frames else OF_AVATARS)[metric]
+        kind: MetricKind = "frame" if of_frames else "avatar"
+        spec = known.get(metric, MetricSpec(metric, label, unit, higher, 0, "", kind=kind))
+        found.append(replace(spec, digits=printed.decimals(metric)))
+    return found
+
+
+def _name(record: MethodRecord, label: str, printed: PrintedTable) -> str:
+    for row in printed.rows:
+        if row.method and row.is_of(record):
+            condition = f" ({record.condition})" if record.condition else ""
+            return f"{row.name}{condition}{label.removeprefix(record.label)}"
+    return label
+
+
+def _cells(row: PrintedRow, table: Table) -> tuple[TableCell, ...]:
+    from .tables import TableCell
+
+    texts = [row.values.get(column.name) for column in table.columns]
+    none = TableCell("none", None, "")
+    return tuple(none if text is None else TableCell("published", float(text), text) for text in texts)
 
 
 def listed() -> list[dict[str, Any]]:

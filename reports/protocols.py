@@ -10,18 +10,16 @@ import tyro
 
 from ..bench.contracts import FrameKey, Progress
 from ..bench.engine.config import CANONICAL
-from ..bench.engine.scoring import FULL
 from ..bench.errors import InputError
 from ..bench.io.files import check_writable, write_text
-from ..bench.named_protocol import NamedProtocol, TaskFrames, named_protocols, protocol_named
+from ..bench.named_protocol import NamedProtocol, TaskFrames, named_protocols
 from ..bench.protocol import TASK_TITLES
 from ..bench.registry import get
+from ..bench.rows import FULL
 from ..bench.specs import CommandResult, MetricSpec, command
 from ..bench.terminal import table
-from .aggregate import summarise
-from .cameras import unseen_cameras
-from .runs import RunSet, synthetic_settings
-from .tables import AVERAGED
+from .aggregate import AVERAGED, summarise
+from .runs import RunSet, synthetic_settings, unseen_cameras
 from .writers import pipe_table
 
 QUALITY = {"psnr": 2, "lpips": 4}
@@ -276,8 +274,3 @@ def _text(
             "\n".join(["Not available from these rows:", "", *(f"- {k}: {v}" for k, v in refused.items())])
         )
     return "\n\n".join(parts)
-
-
-def chosen(runs: RunSet, name: str | None) -> RunSet:
-    """The runs under a named protocol; unchanged for None."""
-    return runs if name is None else under(runs, name, protocol_named(name))

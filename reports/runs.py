@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -12,19 +12,19 @@ from pathlib import Path
 from typing import Any, Self
 
 from ..bench.contracts import ByteArray, Clip, FrameKey
-from ..bench.engine.captures import open_run_clips
 from ..bench.engine.config import RunOptions
-from ..bench.engine.scoring import FULL
 from ..bench.engine.store import FinishedRun, RunFolder
 from ..bench.errors import InputError
 from ..bench.manifest import ClipRecord, Manifest, MethodRecord, cut_of
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, joined_protocol, missing_tasks
-from ..bench.rows import ALL, Rows
-from ..bench.source import is_outside
+from ..bench.registry import is_outside
+from ..bench.rows import ALL, FULL, Rows
 from ..bench.specs import MetricSpec
-from .cameras import SPLIT_TASK, explained, unseen_cameras
-from .coded import check_codecs, with_coded
-from .tables import AVERAGED
+from .aggregate import AVERAGED, check_codecs, with_coded
+
+SPLIT_TASK = "self_reenactment"
+"""Scored at all cameras, of which most have training frames. Values at those and at held-out cameras differ by several dB, so
+tables show them separately."""
 
 
 def synthetic_settings(clip: ClipRecord) -> dict[str, Any]:
@@ -118,21 +118,9 @@ class RunData:
 
     @property
     def image_size(self) -> str:
-        """Size of the images, "width x height", or the range if they differ: of the renders or, without them, that of the protocols."""
-        from ..bench.io.images import probe_image
-
-        first_of_camera = {
-            (task, key.subject, key.camera): key for task in self.tasks for key in reversed(self.keys(task))
-        }
-        sizes = set()
-        for (task, _, _), key in first_of_camera.items():
-            paths = (self.render_path(method, task, key) for method in self.methods)
-            if path := next((path for path in paths if path), None):
-                info = probe_image(path)
-                sizes.add((info.width, info.height))
-        if not sizes:
-            texts = ", ".join(protocol.resolution for protocol in self.manifest.protocols.values())
-            sizes = {(int(w), int(h)) for w, h in re.findall(r"(\d+)x(\d+)", texts)}
+        """Size of the scored images, "width x height", or the range if they differ."""
+        texts = ", ".join(protocol.resolution for protocol in self.manifest.protocols.values())
+        sizes = {(int(w), int(h)) for w, h in re.findall(r"(\d+)x(\d+)", texts)}
         return " to ".join(dict.fromkeys(f"{w} x {h}" for w, h in (min(sizes), max(sizes)))) if sizes else ""
 
     @cached_property
@@ -146,6 +134,8 @@ class RunData:
     def _clips(self) -> Mapping[str, Clip]:
         if self.clips is not None:
             return self.clips
+        from ..bench.engine.captures import open_run_clips  # who shows no pictures opens no capture
+
         config, opened = open_run_clips(self.folder.root, RunOptions(trust=True))
         clips = {clip.subject: clip for clip in opened}
         for entry in self.manifest.clips:
@@ -223,15 +213,12 @@ class RunSet:
 
     @classmethod
     def joined(cls, runs: tuple[RunData, ...]) -> RunSet:
-        """Combine loaded runs, with one protocol and new labels; see `read`."""
-        return cls.of_runs(_with_one_protocol(runs), training_labels(runs))
-
-    @classmethod
-    def of_runs(cls, runs: tuple[RunData, ...], labels: Sequence[Mapping[str, str]]) -> RunSet:
-        """Combine loaded runs, with given labels of each run's methods. Raises `InputError` as `read` does.
+        """Combine loaded runs, with one protocol and new labels; see `read`.
 
         Coded avatars are columns of their methods, see `with_coded`.
         """
+        runs = _with_one_protocol(runs)
+        labels = training_labels(runs)
         if runs:
             check_codecs([run.manifest for run in runs], runs[0].folder.manifest)
         changed = [with_coded(run.manifest, run.rows) for run in runs]
@@ -303,6 +290,11 @@ class RunSet:
         records = {label: replace(record, condition="") for label, record in self.records.items()}
         return replace(self, records=records)
 
+    def listing(self, labels: Sequence[str]) -> Self:
+        """The same runs, whose tables list only these methods and rank them all."""
+        records = {label: replace(self.records[label], condition="") for label in labels}
+        return replace(self, records=records, trivial=())
+
     def only(self, labels: Sequence[str]) -> RunSet:
         """Restrict the runs to some of their methods."""
         records = {label: record for label, record in self.records.items() if label in labels}
@@ -332,25 +324,10 @@ class RunSet:
         return ids | dict.fromkeys((SEEN_CAMERAS, UNSEEN_CAMERAS), ids.get(SPLIT_TASK, ""))
 
     @property
-    def unchecked(self) -> tuple[str, ...]:
-        """A sentence if captures were not searched for errors before a run."""
-        said = "The captures were not searched for errors before the run (--unchecked)."
-        return (said,) if any(run.manifest.unchecked for run in self.runs) else ()
-
-    @property
     def with_refit(self) -> tuple[str, ...]:
         """Labels under conditions that score frames from other views than those of the capture's tracking."""
         changed = {c.name for run in self.runs for c in run.manifest.configuration.conditions if c.views}
         return tuple(label for label, record in self.records.items() if record.condition in changed)
-
-    @property
-    def refitted(self) -> tuple[str, ...]:
-        """A sentence on `with_refit`."""
-        labels = self.with_refit
-        said = (
-            "each scored frame was fitted to its own picture (camera, jaw, expression) with the avatar frozen"
-        )
-        return (f"{', '.join(labels)}: {said}; not comparable with values of tracked frames.",) * bool(labels)
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -360,17 +337,23 @@ class RunSet:
         return tuple(missing_tasks([*asked], done).values())
 
     @property
-    def mixed_code(self) -> tuple[str, ...]:
-        """A sentence on methods of this package whose code, but not version, changed between the runs."""
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on methods of this package whose code, but not version, changed between the runs, on captures that were
+        not searched for errors, and on `with_refit`."""
         codes: dict[str, set[str]] = {}
-        for run in self.runs:
-            for record in run.manifest.methods:
-                if record.code and not is_outside(record.implementation):
-                    codes.setdefault(f"{record.name} (version {record.version})", set()).add(record.code)
-        changed = [name for name, found in codes.items() if len(found) > 1]
-        return (
-            f"Files of these methods changed between the runs, although their version did not: {', '.join(changed)}.",
-        ) * bool(changed)
+        for record in (record for run in self.runs for record in run.manifest.methods):
+            if record.code and not is_outside(record.implementation):
+                codes.setdefault(f"{record.name} (version {record.version})", set()).add(record.code)
+        remarks = []
+        if changed := [name for name, digests in codes.items() if len(digests) > 1]:
+            what = "Files of these methods changed between the runs, although their version did not"
+            remarks.append(f"{what}: {', '.join(changed)}.")
+        if any(run.manifest.unchecked for run in self.runs):
+            remarks.append("The captures were not searched for errors before the run (--unchecked).")
+        if refitted := ", ".join(self.with_refit):
+            how = "each scored frame was fitted to its own picture (camera, jaw, expression) with the avatar frozen"
+            remarks.append(f"{refitted}: {how}; not comparable with values of tracked frames.")
+        return tuple(remarks)
 
     @property
     def cut(self) -> str:
@@ -392,6 +375,44 @@ class RunSet:
     def machine(self) -> str:
         """Machines used to measure speed."""
         return "; ".join(dict.fromkeys(run.machine for run in self.runs))
+
+
+def explained(keys: Collection[FrameKey], unseen: Collection[tuple[str, str]]) -> str:
+    """Describe seen and unseen cameras of the frames ``keys``, with their number if it is equal for every subject."""
+    cameras = {(key.subject, key.camera) for key in keys}
+    subjects = {subject for subject, _ in cameras}
+    counts = {
+        tuple(sum(name == subject for name, _ in group) for group in (cameras - {*unseen}, unseen))
+        for subject in subjects
+    }
+    seen, held_out = (f" ({count} scored)" for count in counts.pop()) if len(counts) == 1 else ("", "")
+    return f"Seen cameras{seen} have training frames in the capture, of other timesteps; unseen cameras{held_out} have none."
+
+
+def unseen_cameras(
+    manifests: Sequence[Manifest], keys: Collection[FrameKey]
+) -> tuple[frozenset[tuple[str, str]], str]:
+    """The (subject, camera) pairs of self-reenactment without training frames; none and a reason, one sentence, if
+    they are all, none, or not the same in all runs.
+    """
+    unseen = set()
+    cameras = {(key.subject, key.camera) for key in keys}
+    for subject in {key.subject for key in keys}:
+        clips = (clip for manifest in manifests for clip in manifest.clips if clip.subject == subject)
+        own = {camera for name, camera in cameras if name == subject}
+        seen = {frozenset(own & {*clip.training_cameras}) for clip in clips}
+        if len(seen) != 1:
+            return frozenset(), _one_column("the runs differ in which cameras were trained on")
+        unseen |= {(subject, camera) for camera in own.difference(*seen)}
+    if not unseen:
+        return frozenset(), _one_column("methods are trained on all of its cameras") if keys else ""
+    if len(unseen) == len(cameras):
+        return frozenset(), _one_column("methods are trained on none of its cameras")
+    return frozenset(unseen), ""
+
+
+def _one_column(why: str) -> str:
+    return f"Self-reenactment is not split into seen and unseen cameras: {why}."
 
 
 def _of_part(rows: Rows, part: FrameSelection, file: Path) -> Rows:

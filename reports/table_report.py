@@ -17,11 +17,7 @@ from ..bench.io.files import write_text
 from ..bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from ..bench.registry import unknown
 from ..bench.specs import MetricSpec
-from .cameras import SPLIT_TASK
-from .papers import printed_tables
-from .printed import as_printed
-from .protocols import chosen
-from .runs import WHOLE, FrameSelection, RunSet
+from .runs import SPLIT_TASK, WHOLE, FrameSelection, RunSet
 from .tables import AVATAR_TITLE, TITLES, Table, build_table
 from .writers import WRITERS, to_text
 
@@ -36,9 +32,7 @@ class ComparedRuns(RunSet):
         """
         metrics = [spec for spec in self.metrics if "comparison" in spec.tables]
         runs = self.by_camera
-        built = build_table(
-            runs.rows, metrics, self.methods, runs.tasks, trivial=self.trivial, protocol_ids=self.protocol_ids
-        )
+        built = build_table(runs.without_conditions, metrics, runs.tasks)
         columns = pd.MultiIndex.from_tuples(
             [(column.task or "avatar", column.metric) for column in built.columns], names=["task", "metric"]
         )
@@ -179,7 +173,12 @@ def tables_of(
     if protocol is not None and part != WHOLE:
         expected = "no --region or --sequences beside it, which it decides"
         raise InputError("command line", "--protocol", expected, part.text)
-    runs = chosen(RunSet.read(run_folders, part), protocol)
+    runs = RunSet.read(run_folders, part)
+    if protocol is not None:
+        from ..bench.named_protocol import protocol_named
+        from .protocols import under
+
+        runs = under(runs, protocol, protocol_named(protocol))
     if paper is None:
         if number is not None:
             raise InputError("command line", "--table", "--as PAPER beside it", "no paper")
@@ -190,6 +189,8 @@ def tables_of(
     if columns or digits or layout != COMPARISON:
         expected = "no --layout, --columns or --digits beside it: a printed table has its own"
         raise InputError("command line", "--as", expected, "one of them")
+    from .papers import as_printed, printed_tables
+
     printed = printed_tables(paper, number)
     if len(printed) > 1 and format not in ("text", "md", "latex"):
         expected = f"one of {', '.join(table.table for table in printed)}, for a file of format {format}"
@@ -225,27 +226,16 @@ def table_of(
     if not tasks and set(columns.names) & set(runs.tasks):
         found = ", ".join(columns.names)
         raise InputError("command line", "--columns", "a metric of frames beside a task", found)
-    return build_table(
-        runs.rows,
-        metrics,
-        runs.methods,
-        tasks,
-        trivial=runs.trivial,
-        changed=runs.changed,
-        protocol_ids=runs.protocol_ids,
-        image_size=runs.image_size,
-        cut=runs.cut,
-        machine=runs.machine,
+    runs = replace(
+        runs,
         part=runs.part if tasks else "",
-        missing=(
-            *(runs.missing if tasks == runs.tasks else ()),
-            *runs.mixed_code,
-            *runs.unchecked,
-            *runs.refitted,
-        ),
         cameras=runs.cameras if {SPLIT_TASK, SEEN_CAMERAS, UNSEEN_CAMERAS} & {*tasks} else "",
-        keys=runs.keys,
-        averaged=runs.averaged,
+    )
+    return build_table(
+        runs,
+        metrics,
+        tasks,
+        missing=(*(runs.missing if tasks == runs.tasks else ()), *runs.remarks),
         avatar_title=TITLES.get(layout, AVATAR_TITLE),
         name=layout,
     )

@@ -6,22 +6,34 @@ so that a long sequence or a subject with many frames does not dominate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from math import inf
+from typing import TYPE_CHECKING, Literal
 
 from ..bench.condition import CONDITION_MARK
 from ..bench.contracts import FrameKey
-from ..bench.engine.scoring import FULL
 from ..bench.progress import counted
 from ..bench.protocol import TASK_TITLES
-from ..bench.rows import ALL, Rows
+from ..bench.rows import ALL, FULL, Rows
 from ..bench.specs import DYNAMIC, MetricSpec
-from .aggregate import Aggregate, subject_means, summarise, whole_images
-from .coded import CODED_CHANGE
-from .conditions import conditions, marks, measured_on, mechanisms, suspects
-from .statistics.comparisons import BestSet, best_set
-from .statistics.paired import LEVEL
+from .aggregate import (
+    AVERAGED,
+    CODED_CHANGE,
+    Aggregate,
+    conditions,
+    marks,
+    measured_on,
+    mechanisms,
+    subject_means,
+    summarise,
+    suspects,
+    whole_images,
+)
+from .statistics.comparisons import LEVEL, BestSet, best_set
+
+if TYPE_CHECKING:
+    from .runs import RunSet
 
 
 @dataclass(frozen=True)
@@ -35,6 +47,11 @@ class Column:
     unit: str
     digits: int
     higher_is_better: bool
+
+    @property
+    def name(self) -> str:
+        """``task/metric``, or the metric alone for one of the avatar as a whole."""
+        return f"{self.task}/{self.metric}" if self.task else self.metric
 
     @property
     def arrow(self) -> str:
@@ -89,9 +106,6 @@ class TaskSummary:
     def size(self) -> str:
         """Amount of data in words."""
         return f"{counted(self.frames, 'frame')}, {counted(self.subjects, 'subject')}"
-
-
-AVERAGED = "frames, then sequences, then subjects"
 
 
 @dataclass(frozen=True)
@@ -221,58 +235,25 @@ CONDITIONS_TITLE = "Under other conditions (not ranked)"
 
 
 def build_table(
-    rows: Rows,
+    runs: RunSet,
     metrics: Sequence[MetricSpec],
-    methods: Sequence[str],
     tasks: Sequence[str],
     *,
-    trivial: Sequence[str] = (),
-    changed: Sequence[str] = (),
-    protocol_ids: Mapping[str, str],
-    image_size: str = "",
-    cut: str = "",
-    machine: str = "",
-    part: str = "",
     missing: Sequence[str] = (),
-    cameras: str = "",
-    keys: Mapping[str, Collection[FrameKey]] | None = None,
-    averaged: str = AVERAGED,
     avatar_title: str = AVATAR_TITLE,
     name: str = "",
 ) -> Table:
-    """Build the comparison table of whole images.
+    """Build the comparison table of whole images of the methods of runs.
 
     A cell has a value only if every frame of the task has one, for every seed of the method, since means
-    over different frames are not comparable. Otherwise it shows "–" or "failed", and a note gives the reason.
+    over different frames are not comparable. Otherwise it shows "–" or "failed", and a note gives the reason. Trivial baselines
+    and methods under conditions (`RunSet.changed`) are listed separately and not ranked.
 
-    Parameters
-    ----------
-    metrics : Sequence[MetricSpec]
-        Columns of the table, in order; metrics of frames appear once in each task, the others last.
-    methods : Sequence[str]
-        Rows, in order; a method without results is shown as not measured.
-    trivial : Sequence[str]
-        Those of ``methods`` that are trivial baselines: listed separately and not ranked.
-    changed : Sequence[str]
-        Those of ``methods`` under conditions that change them, see `RunSet.changed`; also listed
-        separately and not ranked.
-    keys : Mapping[str, Collection[FrameKey]] | None
-        Frames of each task, if some scored frames have no rows.
-    protocol_ids : Mapping[str, str]
-        Readable name of each task's protocol, for the caption, like ``image_size``, ``cut``, ``machine`` (if
-        the rows do not record the machine that measured speed), ``part``, ``cameras``, ``averaged`` and
-        the sentences of ``missing``.
-    avatar_title : str
-        Heading of the columns that belong to no task.
-    name : str
-        Name of the layout.
-
-    Raises
-    ------
-    InputError
-        Rows repeat a frame, or mix versions of a method or protocols in a task.
+    ``metrics`` are the columns, in order; metrics of frames appear once in each of ``tasks``, the others last, below
+    ``avatar_title``. ``missing`` are sentences for the caption, ``name`` is the layout. Raises `InputError` for rows that mix
+    protocols in a task.
     """
-    rows.check()
+    rows, methods, trivial, changed = runs.rows, runs.methods, runs.trivial, runs.changed
     rows.check_protocols("rows")
     places = [
         (spec, task, TASK_TITLES.get(task, task)) for task in tasks for spec in metrics if spec.per_frame
@@ -323,20 +304,20 @@ def build_table(
         groups=tuple((title, members) for title, members in groups if members),
         notes=tuple(notes),
         tasks=tuple(
-            _task_summary(rows, task, protocol_ids.get(task, ""), (keys or {}).get(task, ()))
+            _task_summary(rows, task, runs.protocol_ids.get(task, ""), runs.keys.get(task, ()))
             for task in tasks
         ),
         seeds=max(1, len(rows.seeds(ALL))),
         warnings=(*((*below.values(), BELOW_CAUSES) if below else ()), *off),
         marking=marking,
         starred=starred,
-        image_size=image_size,
-        cut=cut,
-        machine=measured_on(found.get("fps", {}), trivial, machine),
-        part=part,
+        image_size=runs.image_size,
+        cut=runs.cut,
+        machine=measured_on(found.get("fps", {}), trivial, runs.machine),
+        part=runs.part,
         missing=tuple(missing),
-        cameras=cameras,
-        averaged=averaged,
+        cameras=runs.cameras,
+        averaged=runs.averaged,
         name=name,
         tested=any(best is not None and best.methods is not None for best in bests),
     )
@@ -462,3 +443,59 @@ def _marking(
         names = ", ".join(f"{column.title} {column.label}" for column, _ in untested)
         few = f" Too few subjects for a test, ranked by the digits alone: {names}."
     return f"Bold: e{best_of}{others}{few}", f"* E{best_of}{few}"
+
+
+def compact(table: Table) -> Table:
+    """Sort the rows of each group by the first column that has values, best first, and leave out columns without any.
+
+    A column that is left out becomes a sentence in the caption, with its first reason. Columns in which a method failed
+    are kept. Notes that no cell refers to are removed.
+    """
+    kept = [index for index in range(len(table.columns)) if _has_content(table, index)]
+    if not kept:
+        return table
+    left_out: dict[str, list[str]] = {}
+    for index, column in enumerate(table.columns):
+        if index not in kept:
+            note = next(
+                (row.cells[index].note for row in table.rows if row.cells[index].note is not None), None
+            )
+            why = "" if note is None else table.notes[note]
+            left_out.setdefault(why, []).append(f"{column.title} {column.label}".strip())
+    sentences = [
+        f"No values of {', '.join(names)}{f': {why}' if why else ''}".rstrip(".") + "."
+        for why, names in left_out.items()
+    ]
+    used: dict[int, int] = {}
+
+    def cells(row: TableRow) -> tuple[TableCell, ...]:
+        own = [row.cells[index] for index in kept]
+        return tuple(
+            cell if cell.note is None else replace(cell, note=used.setdefault(cell.note, len(used)))
+            for cell in own
+        )
+
+    columns = tuple(table.columns[index] for index in kept)
+    groups = []
+    for title, rows in table.groups:
+        ordered = sorted(rows, key=lambda row: _place(row.cells[kept[0]], columns[0]))
+        groups.append((title, tuple(replace(row, cells=cells(row)) for row in ordered)))
+    return replace(
+        table,
+        columns=columns,
+        groups=tuple(groups),
+        notes=tuple(table.notes[note] for note in used),
+        missing=(*table.missing, *sentences),
+    )
+
+
+def _has_content(table: Table, index: int) -> bool:
+    cells = [row.cells[index] for row in table.rows]
+    return any(cell.value is not None or cell.status == "failed" for cell in cells)
+
+
+def _place(cell: TableCell, column: Column) -> float:
+    """Sort key of rows: the value, negated if higher is better; rows without a value last."""
+    if cell.value is None:
+        return inf
+    return -cell.value if column.higher_is_better else cell.value

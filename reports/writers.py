@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ..bench import terminal
 from ..bench.io.provenance import tool
 from ..bench.io.style import SHAPES, escape_markdown, stylesheet
-from .compact import compact
-from .tables import METHODS_TITLE, TITLES, Column, Table, TableCell
+from .tables import METHODS_TITLE, TITLES, Column, Table, TableCell, compact
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -249,7 +248,7 @@ def to_csv(table: Table) -> str:
     header = ["method", "version", "group"]
     extras = ["rank", "status", *(["spread"] if table.seeds > 1 else [])]
     for column in table.columns:
-        name = column_name(column)
+        name = column.name
         header += [name, *(f"{name}/{extra}" for extra in extras)]
     lines: list[list[object]] = [[*header, "notes", "protocol"]]
     protocol = " ".join(f"{task.task}={task.protocol_hash}" for task in table.tasks)
@@ -286,11 +285,6 @@ def _without_formula(value: object) -> object:
     except ValueError:
         return f"'{value}"
     return value
-
-
-def column_name(column: Column) -> str:
-    """``task/metric``, or the metric alone for one of the avatar as a whole."""
-    return f"{column.task}/{column.metric}" if column.task else column.metric
 
 
 def to_json(table: Table) -> str:

@@ -18,12 +18,10 @@ from ..condition import PLAIN, Condition, Named, label_of
 from ..configuration import build, build_arguments, deciding_settings, merge, setting_paths
 from ..contracts import Budget, TaskName
 from ..errors import InputError
-from ..executors.settings import is_speed
 from ..io.files import check_name, check_utf8
-from ..registry import discover, get, resolve, unknown
-from ..source import code_digest, forget_code, is_outside
+from ..registry import discover, get, is_outside, resolve, unknown
+from ..source import code_digest, forget_code
 from ..specs import ConditionSpec, MethodSpec, MetricSpec, ProfileSpec
-from .adaptation import MethodNeeds
 
 CANONICAL = "canonical"
 """The metric profile that bare metric names belong to."""
@@ -189,6 +187,8 @@ class ResolvedMethod:
 
     def record(self) -> dict[str, Any]:
         """Everything that determines the method's behaviour, for the manifest."""
+        from .adaptation import MethodNeeds  # who only reads runs needs no adaptation
+
         needs = MethodNeeds.of(self.spec)
         code = code_digest(self.spec.implementation) if self.spec.implementation else ""
         return {
@@ -480,7 +480,7 @@ def demo_run_config(config: DemoConfig, device: str) -> dict[str, Any]:
         "seeds": (config.seed,),
         "frames_per_task": QUICK_FRAMES if is_quick else None,
         "metrics": tuple(
-            name for name in default_names("metrics") if not (is_quick and is_speed(get("metrics", name)))
+            name for name in default_names("metrics") if not (is_quick and get("metrics", name).is_speed)
         ),
     }
 

@@ -23,7 +23,7 @@ from ..contracts import Clip
 from ..errors import HeadbenchError, InputError, LeftOutError, UnavailableError, reason_of, shortened
 from ..executors.outcome import read_outcome
 from ..executors.schedule import DAMAGED, Schedule
-from ..executors.settings import Execution, check_executor, is_speed
+from ..executors.settings import Execution, check_executor
 from ..executors.task import Task
 from ..executors.worker import FULL_DISK
 from ..io.files import check_kind, check_output_folder
@@ -246,7 +246,7 @@ def execute(plan: Plan, execution: Execution) -> list[Rows]:
     captures = {subject: index for index, subject in enumerate(dict.fromkeys(j.clip.subject for j in jobs))}
     tasks = [_task(job, captures[job.clip.subject], plan.folder) for job in jobs]
     places = {task.place: job for task, job in zip(tasks, jobs)}
-    steady = [metric for metric in metrics if not is_speed(metric)]
+    steady = [metric for metric in metrics if not metric.is_speed]
     failures: dict[str, str] = {}
     schedule = Schedule(
         "avatars trained and measured", lambda task: places[task.place].is_measured(steady), execution
@@ -322,7 +322,7 @@ def execute_cell(task: Task, report: Callable[[str], None]) -> None:
             log.info("%s", words)
 
     job = replace(job, line=RunProgress({job.name: job.steps(metrics)}, show))
-    run_cell(job, metrics if task.speed else [metric for metric in metrics if not is_speed(metric)])
+    run_cell(job, metrics if task.speed else [metric for metric in metrics if not metric.is_speed])
 
 
 class _Opened:

@@ -16,11 +16,8 @@ from ..errors import HeadbenchError, InputError, LeftOutError, UnavailableError
 from ..io.files import check_name
 from ..machine import processor_count
 from ..registry import resolve
-from ..rows import LEFT_OUT
+from ..rows import FULL, LEFT_OUT
 from ..specs import MetricSpec
-
-FULL = "full"
-"""The region over which every metric is computed: the whole frame."""
 
 _AHEAD = 8
 """Frames decoded ahead of a metric that processes them in order."""

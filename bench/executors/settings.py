@@ -10,7 +10,6 @@ from typing import Any, Literal
 from ..errors import UnavailableError, install_extra
 from ..machine import check_device
 from ..process import environment_variable
-from ..specs import MetricSpec
 
 ExecutorName = Literal["inline", "processes", "slurm"]
 
@@ -89,11 +88,6 @@ class Execution:
                 raise ValueError(f"{name} is {value}; at least 1, or none")
         if self.restarts < 0 or self.poll_s <= 0:
             raise ValueError("restarts is at least 0, poll_s is above 0")
-
-
-def is_speed(metric: MetricSpec) -> bool:
-    """Whether concurrent jobs on the machine would bias a metric of an avatar."""
-    return metric.machine_bound and metric.kind == "avatar"
 
 
 def import_submitit() -> Any:

@@ -20,7 +20,6 @@ from ..progress import counted, duration
 from ..rows import ALL
 from ..specs import CommandResult
 from .outcome import TaskOutcome, read_outcome
-from .settings import is_speed
 from .slurm import Queued, queue, read_submitted
 from .task import TASK_LOG
 
@@ -113,7 +112,7 @@ def cell_states(folder: RunFolder, manifest: Manifest) -> list[CellState]:
     queued = None if submitted is None else _queue()
     jobs = {} if submitted is None else submitted["jobs"]
     failed = dict(_failed(folder, manifest))
-    speed = any(map(is_speed, manifest.metrics))
+    speed = any(metric.is_speed for metric in manifest.metrics)
     works = is_locked(folder.root)
     found = []
     for clip, method, seed in product(manifest.clips, manifest.methods, manifest.configuration.seeds):

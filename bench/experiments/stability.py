@@ -28,13 +28,12 @@ from ..contracts import (
 )
 from ..engine.adaptation import MethodNeeds
 from ..engine.plan import Job
-from ..engine.scoring import FULL
 from ..errors import UnavailableError
 from ..io.images import quantise, write_png
 from ..io.provenance import RENDER
 from ..protocol import Protocol, TaskWithoutTruth, make_protocol_without_truth, protocol_name
 from ..registry import get
-from ..rows import Row
+from ..rows import FULL, Row
 
 log = logging.getLogger(__name__)
 COVERED, SOLID = 0.05, 0.95

@@ -18,12 +18,13 @@ from skimage.color import deltaE_ciede2000
 
 from ..contracts import ByteArray, Camera, FloatArray, Frame, GroundTruth, HeadPose, TrueFrame
 from ..engine.plan import Job
-from ..engine.scoring import FULL, make_metric
+from ..engine.scoring import make_metric
 from ..errors import InputError, UnavailableError
 from ..io.files import digest
 from ..io.images import quantise, read_png, write_png
 from ..io.provenance import SYNTHETIC
 from ..registry import get, resolve
+from ..rows import FULL
 from .stability import LimitCheck
 from .surface import FACE, NO_FACE, absent_surface
 

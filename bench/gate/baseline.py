@@ -11,12 +11,11 @@ from typing import Any, Literal, NamedTuple
 
 import pandas as pd
 
-from ..engine.scoring import FULL
 from ..engine.store import RunFolder
 from ..errors import InputError
 from ..io.documents import checked, read_json, shown
 from ..io.files import check_name, write_json
-from ..rows import ALL, FRAME
+from ..rows import ALL, FRAME, FULL
 from ..specs import MAX_DIGITS, MetricSpec
 from .settings import Captures
 

@@ -17,7 +17,6 @@ from statistics import fmean
 
 import readme_pictures
 
-from headbench.bench.engine.scoring import FULL
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.experiments.robustness import RECORD_FILE
@@ -25,9 +24,8 @@ from headbench.bench.io.files import write_json, write_text
 from headbench.bench.progress import counted
 from headbench.bench.protocol import TASK_TITLES, UNSEEN_CAMERAS
 from headbench.bench.registry import get
-from headbench.bench.rows import Rows
-from headbench.reports.aggregate import summarise
-from headbench.reports.coded import coded_labels
+from headbench.bench.rows import FULL, Rows
+from headbench.reports.aggregate import coded_labels, summarise
 from headbench.reports.curve.curve import CurveData, leaders_text, read_curve
 from headbench.reports.curve.points import HELD_OUT
 from headbench.reports.protocols import choice_effects
@@ -129,8 +127,8 @@ class StoredResults:
         """Means of the suite, as `MeasuredFigures` has them; over all cameras, as papers print them."""
         runs = self.suite
         metrics = [spec for spec in runs.metrics if "comparison" in spec.tables]
-        table = build_table(runs.rows, metrics, runs.ranked, runs.tasks, protocol_ids={})
-        names = [f"{column.task}/{column.metric}".lstrip("/") for column in table.columns]
+        table = build_table(runs.listing(runs.ranked), metrics, runs.tasks)
+        names = [column.name for column in table.columns]
         ((_, rows),) = table.groups
         methods = {row.method: dict(zip(names, (cell.text for cell in row.cells))) for row in rows}
         sizes = {found.resolution for run in runs.runs for found in run.manifest.protocols.values()}

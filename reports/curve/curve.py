@@ -18,19 +18,18 @@ from matplotlib.axes import Axes
 
 from ...bench.condition import Condition
 from ...bench.contracts import Budget, FloatArray, FrameKey, Progress, no_progress
-from ...bench.engine.scoring import FULL
 from ...bench.errors import InputError
 from ...bench.experiments.curve import Over
 from ...bench.experiments.tracking import tracking_error
 from ...bench.io.files import write_text
 from ...bench.manifest import ClipRecord, MethodRecord
-from ...bench.rows import ALL, Rows
+from ...bench.rows import ALL, FULL, Rows
 from ...bench.specs import CommandResult, MetricSpec, command
 from ...bench.terminal import table
 from ..aggregate import subject_means
 from ..plots import MARKERS, SMALL, cost_axis, plot_file, show_missing, start_axes
 from ..runs import RunData
-from ..statistics.paired import LEAST_SUBJECTS, interval
+from ..statistics.comparisons import LEAST_SUBJECTS, interval
 from ..writers import csv_text, pipe_table
 from .points import HELD_OUT, MEASURED, CurvePoint, column, mean_point, points_text
 

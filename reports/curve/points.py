@@ -12,7 +12,7 @@ from typing import Any
 from ...bench.contracts import Budget
 from ...bench.specs import MetricSpec
 from ...bench.terminal import table
-from ..statistics.paired import LEAST_SUBJECTS, half_width
+from ..statistics.comparisons import LEAST_SUBJECTS, half_width
 
 HELD_OUT: Mapping[str, str] = {"novel_view": "camera", "self_reenactment": "timesteps"}
 """Held-out data by task."""

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from ...bench.contracts import Progress, no_progress
-from ...bench.engine.scoring import FULL
 from ...bench.engine.store import FinishedRun
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
@@ -20,17 +19,16 @@ from ...bench.io.images import probe_image
 from ...bench.io.provenance import COMPOSITE, source_type
 from ...bench.io.style import SHAPES, policy_hash, stylesheet
 from ...bench.protocol import TASK_TITLES
+from ...bench.rows import FULL
 from ...bench.specs import CommandResult, MetricSpec, command
 from ..aggregate import summarise
-from ..compact import compact
 from ..drawing import colour_map
-from ..papers import printed_tables
+from ..papers import as_printed, printed_tables
 from ..pareto.points import LATENCY, SIZE, SPEED, pareto_front
-from ..printed import as_printed
 from ..runs import FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
 from ..table_report import COMPARISON, layouts, table_of
-from ..tables import AVATAR_TITLE, TITLES, Table
+from ..tables import AVATAR_TITLE, TITLES, Table, compact
 from ..writers import render_page
 from .frames import Opening, Pictures, ShownFrame, choose_pictures, frame_values, opening, worst_frames
 from .sections import (

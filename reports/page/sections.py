@@ -22,12 +22,10 @@ from ...bench.protocol import TASK_TITLES
 from ...bench.registry import get
 from ...bench.rows import ALL
 from ...bench.specs import MethodSpec, MetricSpec
-from ..aggregate import summarise
-from ..conditions import mechanisms
+from ..aggregate import mechanisms, summarise
 from ..pareto.points import SIZE, SPEED
 from ..runs import RunData, RunSet
-from ..statistics.comparisons import subjects_needed
-from ..statistics.paired import LEVEL
+from ..statistics.comparisons import LEVEL, subjects_needed
 from ..tables import BELOW_CAUSES, not_better
 
 NAMED = 3

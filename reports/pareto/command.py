@@ -17,8 +17,7 @@ from .settings import ParetoSettings
 
 if TYPE_CHECKING:
     from ...bench.specs import MetricSpec
-    from .points import ParetoPoint
-    from .rates import RateDifference, RatePoint
+    from .points import ParetoPoint, RateDifference, RatePoint
 
 
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
@@ -39,8 +38,7 @@ def pareto(
     from ..runs import RunData, joined_subjects
     from ..writers import csv_text
     from .plot import write_plot
-    from .points import ParetoPoint, front_of, read_points
-    from .rates import read_rates
+    from .points import ParetoPoint, front_of, read_points, read_rates
 
     read = joined_subjects([RunData.read(Path(run)) for run in runs])
     points, left_out, metric, note = read_points(read, task, metric_name, time)
@@ -86,7 +84,7 @@ def _rates(
     """Write the files of rate and distortion; return the differences to the reference, none with fewer than two steps."""
     from ..writers import csv_text
     from .plot import write_rates
-    from .rates import rate_differences
+    from .points import rate_differences
 
     methods = list(dict.fromkeys(point.method for point in points))
     if reference and reference not in methods:

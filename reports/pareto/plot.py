@@ -13,8 +13,7 @@ from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import MetricSpec
 from ..plots import GREY, MARKERS, SMALL, cost_axis, plot_file, show_missing, start_axes
-from .points import ParetoPoint, front_of
-from .rates import RatePoint
+from .points import ParetoPoint, RatePoint, front_of
 
 MARKER = 7.0
 """Diameter of a point, in points of 1/72 inch."""

@@ -130,7 +130,7 @@ def compare_methods(
     runs: RunSet, settings: CompareSettings, progress: Progress = no_progress
 ) -> CommandResult:
     """`compare_runs` of loaded runs; runs, region and sequences of the settings are ignored."""
-    from ..conditions import conditions, note_of
+    from ..aggregate import conditions, note_of
     from ..table_report import COMPARISON
     from ..tables import BELOW_CAUSES, not_better
     from .comparisons import compare

@@ -8,8 +8,7 @@ from ...bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
 from ..runs import RunSet, synthetic_settings
 from ..writers import pipe_table
 from .command import equivalence_text
-from .comparisons import PairedComparison, as_one_family, compare
-from .paired import LEVEL
+from .comparisons import LEVEL, PairedComparison, as_one_family, compare
 
 PAIR = ("ours", "ga")
 PRIMARY = tuple(product(("novel_view", SEEN_CAMERAS, UNSEEN_CAMERAS), ("psnr", "lpips")))

@@ -9,17 +9,16 @@ from math import sqrt
 from pathlib import Path
 from statistics import fmean, stdev, variance
 
-from ...bench.engine.scoring import FULL
 from ...bench.engine.store import RunFolder
 from ...bench.experiments.suite_settings import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, SEEDS_RUN, TRACKED
 from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
-from ...bench.rows import ALL
+from ...bench.rows import ALL, FULL
 from ..aggregate import means_by_seed, whole_images
 from ..runs import WHOLE, FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
+from ..statistics.comparisons import LEVEL as TEST_LEVEL
 from ..statistics.comparisons import PairedComparison, compare, subjects_needed
-from ..statistics.paired import LEVEL as TEST_LEVEL
 from ..statistics.primary import PAIR, primary_section
 from ..table_report import Columns, table_of
 from ..tables import Column, Table, TableCell, TableRow

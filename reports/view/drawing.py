@@ -12,9 +12,7 @@ import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, SplatAvatar
 from ...bench.io.images import quantise
-from .live_source import LIVE
-from .scene import Scene, ShownAvatar
-from .state import FreeView, State
+from .scene import LIVE, FreeView, Scene, ShownAvatar, State
 
 LABEL_PX = 22
 CAPTURED = "captured"

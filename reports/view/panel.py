@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...bench.contracts import FloatArray
-from .live_source import LIVE
-from .scene import NEUTRAL, Scene
-from .state import Sliders, State
+from .scene import LIVE, NEUTRAL, Scene, Sliders, State
 
 JAW, NECK, EYES = ("open", "sideways", "roll"), ("nod", "turn", "tilt"), ("up and down", "sideways")
 REACH = {"jaw": 0.4, "neck": 0.5, "eyes": 0.5}

@@ -23,8 +23,7 @@ from ...bench.io.video import write_browser_video
 from ...bench.registry import resolve
 from .drawing import draw, rotations, splats_of
 from .panel import ControlPanel
-from .scene import Scene
-from .state import FreeView, State
+from .scene import FreeView, Scene, State
 
 log = logging.getLogger(__name__)
 SCALE = 100.0

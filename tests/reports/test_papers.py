@@ -11,8 +11,7 @@ from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.registry import discover
 from headbench.reports import papers as module
-from headbench.reports.papers import FOLDER, Paper, counts, papers, printed_tables
-from headbench.reports.printed import as_printed
+from headbench.reports.papers import FOLDER, Paper, as_printed, counts, papers, printed_tables
 from headbench.reports.runs import RunSet
 from headbench.reports.table_report import table_text
 
@@ -92,7 +91,7 @@ def test_printed_metrics_that_a_run_lacks_are_missing(write_run, tmp_path, monke
     paper = yaml.safe_load((FOLDER / f"{PAPER}.yaml").read_text())
     paper["tables"][0]["rows"][0]["values"] = {"novel_view/csim": "0.91", "cross_reenactment/csim": "0.6"}
     (tmp_path / "other.yaml").write_text(yaml.safe_dump(paper))
-    monkeypatch.setattr(module, "papers", lambda: {"other": build_file(Paper, tmp_path / "other.yaml")})
+    monkeypatch.setattr(module, "FOLDER", tmp_path)
     (printed,) = printed_tables("other", "3")
     table = as_printed(RunSet.read([write_run("a", {"ga": 30.0})]), "other", printed)
     csim = [column.metric for column in table.columns].index("csim")

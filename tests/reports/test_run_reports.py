@@ -77,8 +77,9 @@ def test_rows_of_what_the_run_does_not_have_are_refused(toy_run, column):
 def test_a_damaged_render_is_named(toy_run):
     path = next((toy_run / "subject1" / "toy").rglob("*.png"))
     path.write_bytes(b"no image")
+    data = RunData.read(toy_run)
     with pytest.raises(InputError, match=path.name):
-        table_text([toy_run])
+        [data.render("toy", task, key) for task in data.tasks for key in data.keys(task)]
 
 
 def test_the_number_under_an_image_is_that_of_the_whole_image(toy_run):

@@ -5,11 +5,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
-from headbench.bench.rows import Rows
 from headbench.bench.specs import Mechanism, MetricSpec
-from headbench.reports.tables import build_table
+from headbench.reports.tables import compact
 from headbench.reports.writers import to_markdown, to_text
 
+from .conftest import LPIPS, PSNR, SIZE
 from .made_rows import avatar_row, row, table_of
 
 METRIC = MetricSpec("m", "M", "", True, 2, "m:m")
@@ -59,7 +59,7 @@ def test_a_mechanism_that_is_off_is_named_and_none_is_ranked(make_rows, metrics)
         for method, values in found.items()
         for subject, value in zip("st", values)
     ]
-    table = build_table(Rows.of(rows), [spec], [*found], [], protocol_ids={})
+    table = table_of(pd.DataFrame(rows), [spec], found, [])
     assert table.warnings == ("a: lines off: 3.5 % of the splats change (opacity).",)
     assert {cell.rank for row in table.rows for cell in row.cells} == {None}
     assert table.notes == ("lines: opacity.", "lines left out: opacity.")
@@ -195,3 +195,28 @@ def test_seeds_have_their_spread_and_subjects_theirs_not():
     assert one.shown == f"{one.text} ± 0.500"
     single = table_of(many_subjects(levels), [METRIC], levels, ["novel_view"])
     assert {row.cells[0].spread for row in single.rows} == {""}
+
+
+def without_lpips(values):
+    rows = [row(method, "psnr", value) for method, value in values.items()]
+    rows += [row(method, "lpips", float("nan"), status="missing", reason="No weights.") for method in values]
+    rows += [avatar_row(method, "size", size) for size, method in enumerate(values, 1)]
+    return table_of(pd.DataFrame(rows), [PSNR, LPIPS, SIZE], values, ["novel_view"])
+
+
+def test_rows_are_best_first_and_empty_columns_a_sentence():
+    table = without_lpips({"a": 20.0, "b": 30.0, "c": 25.0})
+    found = compact(table)
+    assert [line.method for line in found.rows] == ["b", "c", "a"]
+    assert [column.metric for column in found.columns] == ["psnr", "size"]
+    assert "No values of Novel view LPIPS: No weights." in found.caption
+    assert found.notes == ()
+    assert {line.method: line.cells[0].value for line in found.rows} == {
+        line.method: line.cells[0].value for line in table.rows
+    }
+
+
+def test_a_table_without_values_stays():
+    rows = [row("a", "lpips", float("nan"), status="missing", reason="No weights.")]
+    table = table_of(pd.DataFrame(rows), [LPIPS], ["a"], ["novel_view"])
+    assert compact(table) == table

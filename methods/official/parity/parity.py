@@ -20,7 +20,6 @@ from ....bench.contracts import Progress, no_progress
 from ....bench.engine.config import RunConfig, parse_size, resolve_cells
 from ....bench.engine.plan import check_settings
 from ....bench.engine.run import run
-from ....bench.engine.scoring import FULL
 from ....bench.engine.store import RunFolder
 from ....bench.engine.stored import TRAINING_FILE
 from ....bench.errors import InputError
@@ -30,7 +29,7 @@ from ....bench.io.files import write_json, write_text
 from ....bench.io.lock import locked
 from ....bench.progress import log_to_file
 from ....bench.registry import get
-from ....bench.rows import Rows
+from ....bench.rows import FULL, Rows
 from ....bench.specs import CommandResult, command
 from ...flashavatar.config import FlashAvatarConfig
 from ...rgbavatar.config import RGBAvatarConfig

@@ -28,6 +28,7 @@ from headbench.bench.manifest import Manifest
 from headbench.bench.registry import Plugin
 from headbench.bench.rows import Rows
 from headbench.bench.specs import ReportSpec
+from headbench.reports.runs import RunSet
 from headbench.reports.tables import METHODS_TITLE, SUSPECT_TITLE, build_table
 
 
@@ -440,8 +441,8 @@ def test_frames_as_good_as_the_truth_are_suspect_and_not_ranked(config, toy, mon
     rows = rows_of(config, methods=("toy_plugin:METHOD", "toy_plugin:MIRROR"), metrics=("psnr",))
     assert set(rows["reason"][rows["method"] == "mirror"]) == {"suspect: above 50 dB"}
     assert set(rows["reason"][rows["method"] == "toy"]) == {""}
-    psnr = RunFolder(Path(config.out)).read_manifest().metrics
-    table = build_table(Rows(rows), psnr, ("mirror", "toy"), ("novel_view",), protocol_ids={})
+    runs = RunSet.read([Path(config.out)])
+    table = build_table(runs, runs.metrics, ("novel_view",))
     groups = {title: [line.method for line in lines] for title, lines in table.groups}
     assert groups == {METHODS_TITLE: ["toy"], SUSPECT_TITLE: ["mirror"]}
 

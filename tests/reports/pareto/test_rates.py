@@ -18,7 +18,7 @@ from headbench.bench.errors import InputError
 from headbench.bench.rows import Row, Rows
 from headbench.bench.specs import MetricSpec
 from headbench.reports.pareto.command import pareto_runs
-from headbench.reports.pareto.rates import rate_difference
+from headbench.reports.pareto.points import rate_difference
 from headbench.reports.pareto.settings import ParetoSettings
 
 STEPS = ("coded-x0.25", "coded-x0.5", "coded", "coded-x2")

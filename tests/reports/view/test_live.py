@@ -105,8 +105,7 @@ def test_avatars_show_the_poses_of_lines(scene, method):
 
     from headbench.datasets.drive.live import LiveDriver
     from headbench.reports.view.drawing import pose_of
-    from headbench.reports.view.live_source import LIVE
-    from headbench.reports.view.state import State
+    from headbench.reports.view.scene import LIVE, State
 
     shown = next(one for one in scene.shown if one.label == method)
     made = LivePoses({shown.version: LiveDriver(shown.form.clip.head, "avatar")})

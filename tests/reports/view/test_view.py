@@ -20,10 +20,9 @@ from headbench.reports.view.drawing import (
     rotations,
     splats_of,
 )
-from headbench.reports.view.scene import open_scene
+from headbench.reports.view.scene import FreeView, Sliders, State, open_scene
 from headbench.reports.view.server import view_avatars
 from headbench.reports.view.settings import ViewSettings
-from headbench.reports.view.state import FreeView, Sliders, State
 
 
 def keys(scene, split="train"):
