@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from headbench.bench import cli, comparison
-from headbench.bench.engine import captures
+from headbench.bench import cli, comparison, registry
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.config import parse_size
 from headbench.bench.errors import HeadbenchError, InputError
@@ -217,7 +216,7 @@ def test_a_run_takes_settings_and_executors_from_its_options(seen, tmp_path):
 
 def test_a_run_takes_the_reader_that_finds_its_capture(monkeypatch, seen, tmp_path, toy):
     plugins = {name: Plugin(name, "", replace(toy.READER, name=name)) for name in ("toy", "other")}
-    monkeypatch.setattr(captures, "discover", lambda group: {"toy": plugins["toy"]})
+    monkeypatch.setattr(registry, "discover", lambda group: {"toy": plugins["toy"]})
     (tmp_path / "data").mkdir()
     words = ["run", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]
     assert cli.main(words) == 0
@@ -225,7 +224,7 @@ def test_a_run_takes_the_reader_that_finds_its_capture(monkeypatch, seen, tmp_pa
     assert cli.main(words) == 0
     assert cli.main([*words, "--set", "reader=colmap"]) == 0
     assert [config.reader for config, _ in seen] == ["ga", "toy", "colmap"]
-    monkeypatch.setattr(captures, "discover", lambda group: plugins)
+    monkeypatch.setattr(registry, "discover", lambda group: plugins)
     assert cli.main(words) == 2
 
 

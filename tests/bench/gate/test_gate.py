@@ -132,7 +132,7 @@ def test_a_missing_subject_is_code_3_also_beside_a_regression(stored, remeasured
             lambda rows: rows.assign(status=["failed", *rows["status"][1:]], reason="no gold"),
             "failed: no gold",
         ),
-        (lambda rows: rows.assign(value=[math.inf, *rows["value"][1:]]), "a finite value"),
+        (lambda rows: rows.assign(value=[math.inf, *rows["value"][1:]]), "a value that is not finite"),
         (lambda rows: pd.concat([rows, rows.iloc[:1]]), "measured twice"),
     ],
 )
