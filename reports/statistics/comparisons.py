@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import stdtrit
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
@@ -139,8 +138,10 @@ def half_width(values: Sequence[float], level: float = LEVEL) -> float:
 
     The standard deviation of subject means includes the variation within subjects (frames, sequences, seeds).
     """
+    from scipy.stats import t as student_t  # takes a second to import, which most tables do without
+
     count = len(values)
-    return float(stdtrit(count - 1, 1 - level / 2)) * stdev(values) / math.sqrt(count)
+    return float(student_t.ppf(1 - level / 2, count - 1)) * stdev(values) / math.sqrt(count)
 
 
 def interval(values: Sequence[float], level: float = LEVEL) -> tuple[float, float] | None:
