@@ -246,7 +246,9 @@ def _metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
         label, unit, higher = (OF_FRAMES if of_frames else OF_AVATARS)[metric]
         kind: MetricKind = "frame" if of_frames else "avatar"
         spec = known.get(metric, MetricSpec(metric, label, unit, higher, 0, "", kind=kind))
-        found.append(replace(spec, digits=printed.decimals(metric)))
+        # Printed training times are stored in seconds.
+        digits = 1 if metric == "training_time" else printed.decimals(metric)
+        found.append(replace(spec, digits=digits))
     return found
 
 
@@ -261,9 +263,17 @@ def _name(record: MethodRecord, label: str, printed: PrintedTable) -> str:
 def _cells(row: PrintedRow, table: Table) -> tuple[TableCell, ...]:
     from .tables import TableCell
 
-    texts = [row.values.get(column.name) for column in table.columns]
+    texts = [_shown(column.name, row.values.get(column.name)) for column in table.columns]
     none = TableCell("none", None, "")
     return tuple(none if text is None else TableCell("published", float(text), text) for text in texts)
+
+
+def _shown(name: str, text: str | None) -> str | None:
+    """A stored value in the unit of its column: training times are stored in seconds and shown in minutes."""
+    if text is None or name != "training_time":
+        return text
+    minutes = float(text) / 60
+    return f"{minutes:.1f}" if minutes >= 1 else f"{minutes:.2g}"
 
 
 def listed() -> list[dict[str, Any]]:

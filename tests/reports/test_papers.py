@@ -101,6 +101,16 @@ def test_printed_metrics_that_a_run_lacks_are_missing(write_run, tmp_path, monke
     assert "Cross-reenactment is printed, but not measured here." in table.caption
 
 
+def test_printed_training_times_are_in_the_unit_of_their_column(write_run):
+    """Table 3 of the paper: 10 minutes of INSTA, 3.5 hours of PointAvatar."""
+    (printed,) = printed_tables("gpavatar-2025", "3")
+    table = as_printed(RunSet.read([write_run("a", {"ga": 30.0})]), "gpavatar-2025", printed)
+    column = [column.metric for column in table.columns].index("training_time")
+    assert table.columns[column].unit == "min"
+    shown = {row.method: row.cells[column].text for row in table.groups[-1][1]}
+    assert (shown["INSTA"], shown["PointAvatar"]) == ("10.0", "210.0")
+
+
 @pytest.mark.parametrize("format", ["text", "md", "latex", "html", "csv", "json"])
 def test_every_format_has_measured_and_printed_values(write_run, format):
     folder = write_run("a", {"ours": 33.25})
