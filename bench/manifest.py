@@ -177,7 +177,13 @@ def _text(value: Any) -> str:
     if isinstance(value, dict):
         texts = ((name, _text(entry)) for name, entry in value.items() if entry)
         return ", ".join(f"{name} {text}" for name, text in texts if text)
-    return ", ".join(map(str, value)) if isinstance(value, list) else "none" if value is None else str(value)
+    return (
+        ", ".join(map(str, value))
+        if isinstance(value, list)
+        else "none"
+        if value is None
+        else str(value) or "none"
+    )
 
 
 @dataclass(frozen=True)
@@ -263,7 +269,7 @@ class Manifest:
         found = [*differences(*settings)]
         if not found:
             found = [*differences(*results)]
-            for record in earlier.methods:
+            for record in (record for record in earlier.methods if record.label in methods):
                 own = methods[record.label]
                 then = {name: getattr(record, name) for name in own}
                 if own["config"] and then["config"]:  # the record also has paths on this machine
@@ -287,6 +293,11 @@ class Manifest:
     def _compared(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """What was asked for, and what it led to."""
         settings = {key: value for key, value in asdict(self.configuration).items() if key not in ELSEWHERE}
+        settings["reader_settings"] = {
+            key: value
+            for key, value in settings["reader_settings"].items()
+            if not (isinstance(value, str) and Path(value).is_absolute())
+        }
         return {"configuration": settings}, {
             "methods": [method.label for method in self.methods],
             "metrics": {metric.name: metric.implementation for metric in self.metrics},

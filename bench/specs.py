@@ -508,7 +508,7 @@ def _options(function: Callable[..., CommandResult]) -> type:
         if name != "progress":
             members.append((name, hints[name], field(**default)))
     doc = (inspect.getdoc(function) or "").partition("\n\n")[2]
-    return make_dataclass("Options", members, namespace={"__doc__": doc}, frozen=True)
+    return make_dataclass("Options", members, namespace={"__doc__": doc}, frozen=True, kw_only=True)
 
 
 COMMAND_GROUPS = ("compare", "inspect", "data", "export", "validate")

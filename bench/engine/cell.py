@@ -50,7 +50,11 @@ def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
     If the cell's condition animates the avatar, that change replaces the last two stages.
     """
     if job.is_measured(metrics):
-        return stored_rows(job, metrics)
+        try:
+            return stored_rows(job, metrics)
+        except InputError as error:
+            log.warning("%s: measured again, since its rows cannot be read: %s", job.name, error)
+            job.cell.update(measured=[])
     avatar = train(job) if job.source is None else derive(job)
     if job.condition.drive:
         return drive(job, avatar, metrics)
@@ -114,9 +118,9 @@ def train(job: Job) -> Avatar:
         "load": {"machine": load.machine, **load.details},
         "finished_at": datetime.now(UTC).timestamp(),
     }
+    write_losses(job)
     cell.update(state="trained", training=training)
     log.info("%s: trained in %s", job.name, duration(seconds))
-    write_losses(job)
     return job.load()
 
 

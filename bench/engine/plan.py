@@ -189,10 +189,15 @@ def source_fingerprint(job: Job) -> str:
     Raises `InputError` where there is none, and for one that was trained with other settings or on another capture.
     """
     assert job.source is not None
-    record = trained_record(job.source)
-    now = job.method.identity()["config"]
-    then = record.get("method", {}).get("config", now)
-    changed = [*differences(then and {name: then.get(name) for name in now}, now, "method.config")][:3]
+    record, identity = trained_record(job.source), job.method.identity()
+    if not job.source.avatar.is_dir():
+        remedy = "Name the run that trained it, if its avatars were not deleted."
+        raise InputError(job.source.avatar, "", "a stored avatar", "none", remedy)
+    now = {name: identity[name] for name in ("version", "config", "budget")}
+    then = {**now, **{name: value for name, value in record.get("method", {}).items() if name in now}}
+    if now["config"] and then["config"]:  # settings that have come since then are no difference of their own
+        then["config"] = {name: then["config"].get(name) for name in now["config"]}
+    changed = [*differences(then, now, "method")][:3]
     if changed:
         keys, found, wanted = (", ".join(each) for each in zip(*changed))
         expected = f"an avatar of the settings of this run, {wanted}"

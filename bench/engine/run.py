@@ -269,7 +269,11 @@ def execute(plan: Plan, execution: Execution) -> list[Rows]:
 def _merged(job: Job, metrics: Sequence[MetricSpec], failure: str | None) -> Rows:
     """Rows of a cell that has ended."""
     if failure is None and job.is_measured(metrics):
-        return stored_rows(job, metrics)
+        try:
+            return stored_rows(job, metrics)
+        except InputError as error:
+            job.cell.update(measured=[])  # measured again by the next start
+            return failed_rows(job, metrics, reason_of(error))
     return failed_rows(job, metrics, failure or f"HeadbenchError: {DAMAGED}")
 
 
