@@ -92,7 +92,9 @@ class StoredResults:
         printed = to_text(table_of(demo, columns=replace(columns, names=(NOVEL, "psnr", "ssim", "lpips"))))
         lines = [f"{OURS}+{name}" for name in get("methods", OURS).ablations]
         return {
-            ("README.md", "demo"): "```text\n{}\n```".format(printed.partition("\n\n")[0]),
+            ("README.md", "demo"): "```text\n{}\n```".format(
+                next(part for part in printed.split("\n\n") if "\nMethod" in part)
+            ),
             ("README.md", "suite"): main_table(self.ranked),
             ("README.md", "findings"): findings(self.suite, self.curve("seconds")),
             (f"{DOCS}/results.md", "demo"): to_markdown(table_of(demo, columns=columns)).strip(),
