@@ -161,6 +161,16 @@ def differences(then: Any, now: Any, key: str = "") -> Iterator[tuple[str, str, 
         yield key, _text(then), _text(now)
 
 
+def identity_differences(
+    record: Mapping[str, Any], identity: Mapping[str, Any], key: str
+) -> list[tuple[str, str, str]]:
+    """`differences` of a method's record from a `ResolvedMethod.identity`, which lacks the record's paths on this machine."""
+    then = {name: record.get(name) for name in identity}
+    if identity.get("config") and then["config"]:
+        then["config"] = {name: then["config"].get(name) for name in identity["config"]}
+    return [*differences(then, identity, key)]
+
+
 def _plain(value: Any) -> Any:
     """A value as in a JSON file; named entries of a list by their name."""
     value = json.loads(json.dumps(value, default=to_jsonable))
@@ -269,13 +279,9 @@ class Manifest:
         found = [*differences(*settings)]
         if not found:
             found = [*differences(*results)]
-            for record in (record for record in earlier.methods if record.label in methods):
-                own = methods[record.label]
-                then = {name: getattr(record, name) for name in own}
-                if own["config"] and then["config"]:  # the record also has paths on this machine
-                    then["config"] = {name: then["config"].get(name) for name in own["config"]}
-                changed = differences(then, own)
-                found += [(f"methods.{record.label}.{key}", old, new) for key, old, new in changed]
+            for record in earlier.methods:
+                if own := methods.get(record.label):  # "methods" names a label that is missing
+                    found += identity_differences(vars(record), own, f"methods.{record.label}")
         if found:
             keys, before, wanted = ([each[place] for each in found[:3]] for place in range(3))
             more = f" and {counted(len(found) - 3, 'other difference')}" if found[3:] else ""

@@ -49,12 +49,8 @@ def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
 
     If the cell's condition animates the avatar, that change replaces the last two stages.
     """
-    if job.is_measured(metrics):
-        try:
-            return stored_rows(job, metrics)
-        except InputError as error:
-            log.warning("%s: measured again, since its rows cannot be read: %s", job.name, error)
-            job.cell.update(measured=[])
+    if (rows := kept_rows(job, metrics)) is not None:
+        return rows
     avatar = train(job) if job.source is None else derive(job)
     if job.condition.drive:
         return drive(job, avatar, metrics)
@@ -62,12 +58,30 @@ def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
     return measure(job, avatar, metrics)
 
 
-def stored_rows(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
-    """The rows of a measured cell. Raises `InputError` if they are missing or damaged."""
-    rows = Rows.read(job.cell.rows)
+def kept_rows(job: Job, metrics: Sequence[MetricSpec]) -> Rows | None:
+    """Rows of these metrics if all are measured, else None."""
+    rows = stored_rows(job) if job.is_measured(metrics) else None
+    if rows is None:
+        return None
     if job.cell.is_trained:
         log.info("%s: kept: trained %s", job.name, trained_ago(job.cell.record))
     return rows.of_metrics([spec.name for spec in metrics])
+
+
+def stored_rows(job: Job) -> Rows | None:
+    """Rows of the metrics that the cell is recorded to have; None for none.
+
+    If they are missing or damaged, the record is withdrawn, so that they are measured again.
+    """
+    done = job.cell.record.get("measured", [])
+    if not done:
+        return None
+    try:
+        return Rows.read(job.cell.rows).of_metrics(done)
+    except InputError as error:
+        log.warning("%s: to be measured again, since its rows cannot be read: %s", job.name, error)
+        job.cell.update(measured=[])
+        return None
 
 
 def train(job: Job) -> Avatar:
@@ -219,7 +233,8 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
 
     Metrics with the same implementation are one measurement. Returns the rows of all ``metrics``.
     """
-    cell, record = job.cell, job.cell.record
+    cell, earlier = job.cell, stored_rows(job)
+    record = cell.record
     done = record.get("measured", [])
     wanted = [spec for spec in metrics if spec.name not in done]
     per_frame = [spec for spec in wanted if spec.per_frame]
@@ -236,9 +251,8 @@ def measure(job: Job, avatar: Avatar, metrics: Sequence[MetricSpec]) -> Rows:
                 # JSON has only finite numbers; a metric with another value has its own row.
                 details[spec.name] = {k: v for k, v in found if not isinstance(v, float) or math.isfinite(v)}
             rows.append(_avatar_row(job, spec, measured[spec.implementation]))
-    earlier = [Rows.read(cell.rows).of_metrics(done)] if done else []
     names = dict.fromkeys([*(spec.name for spec in metrics), *done])
-    result = Rows.joined([*earlier, Rows.of(rows)]).of_metrics([*names])
+    result = Rows.joined([*([] if earlier is None else [earlier]), Rows.of(rows)]).of_metrics([*names])
     result.write(cell.rows)
     codec = avatar.codec if isinstance(avatar, CodedAvatar) else ""
     cell.update(measured=[*names], details=details, codec=codec)

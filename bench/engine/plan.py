@@ -25,7 +25,7 @@ from ..manifest import (
     Manifest,
     MethodRecord,
     ProtocolRecord,
-    differences,
+    identity_differences,
 )
 from ..progress import RunProgress, duration, progress
 from ..protocol import Protocol, make_protocols, protocol_name
@@ -148,11 +148,10 @@ class Job:
         record = self.cell.record
         if record.get("fingerprint", self.fit_fingerprint) != self.fit_fingerprint:
             now = self.method.identity()
-            then = {name: value for name, value in record.get("method", now).items() if name in now}
-            changed = [*differences(then, now)][:3]
+            changed = identity_differences(record.get("method", now), now, "method")[:3]
             raise InputError(
                 self.cell.file,
-                ", ".join(f"method.{key}" for key, _, _ in changed) or "fingerprint",
+                ", ".join(key for key, _, _ in changed) or "fingerprint",
                 ", ".join(then for _, then, _ in changed) or "the data, device and condition of this run",
                 ", ".join(now for _, _, now in changed) or "others",
                 f"Choose another --out, or delete {self.cell.folder}.",
@@ -194,11 +193,7 @@ def source_fingerprint(job: Job) -> str:
         remedy = "Name the run that trained it, if its avatars were not deleted."
         raise InputError(job.source.avatar, "", "a stored avatar", "none", remedy)
     now = {name: identity[name] for name in ("version", "config", "budget")}
-    then = {**now, **{name: value for name, value in record.get("method", {}).items() if name in now}}
-    if now["config"] and then["config"]:  # settings that have come since then are no difference of their own
-        then["config"] = {name: then["config"].get(name) for name in now["config"]}
-    changed = [*differences(then, now, "method")][:3]
-    if changed:
+    if changed := identity_differences(record.get("method", now), now, "method")[:3]:
         keys, found, wanted = (", ".join(each) for each in zip(*changed))
         expected = f"an avatar of the settings of this run, {wanted}"
         raise InputError(job.source.file, keys, expected, found, "Give the settings of the source.")

@@ -36,7 +36,7 @@ from ..registry import discover, get, resolve
 from ..rows import Rows
 from ..specs import MAX_LABEL, DatasetSpec, MetricSpec
 from .captures import located, open_clips
-from .cell import failed_rows, run_cell, stored_rows
+from .cell import failed_rows, kept_rows, run_cell
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
 from .plan import Job, Plan, make_jobs, make_plan
 from .scoring import compared_over_time, make_metric
@@ -268,13 +268,8 @@ def execute(plan: Plan, execution: Execution) -> list[Rows]:
 
 def _merged(job: Job, metrics: Sequence[MetricSpec], failure: str | None) -> Rows:
     """Rows of a cell that has ended."""
-    if failure is None and job.is_measured(metrics):
-        try:
-            return stored_rows(job, metrics)
-        except InputError as error:
-            job.cell.update(measured=[])  # measured again by the next start
-            return failed_rows(job, metrics, reason_of(error))
-    return failed_rows(job, metrics, failure or f"HeadbenchError: {DAMAGED}")
+    rows = kept_rows(job, metrics) if failure is None else None
+    return failed_rows(job, metrics, failure or f"HeadbenchError: {DAMAGED}") if rows is None else rows
 
 
 def _machine_of(jobs: Sequence[Job], otherwise: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -90,6 +90,16 @@ def test_settings_are_options_and_findings_are_printed(offer, capsys):
     assert "Most that may be wrong." in capsys.readouterr().out
 
 
+def test_parameters_of_a_command_are_its_options_in_any_order():
+    """A required one by name may stand behind one with a default."""
+
+    @specs.command("jot", group="toys")
+    def jot(text: str = "a", *, data: str, progress):
+        """Note it."""
+
+    assert vars(jot.options(data="x")) == {"text": "a", "data": "x"}
+
+
 def test_lists_have_commas_or_spaces(offer, capsys):
     offer("count", spec="toy_command:count")
     for words, lists in (

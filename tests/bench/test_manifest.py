@@ -37,6 +37,17 @@ def test_the_published_manifest_is_written_as_it_was_read(published, tmp_path):
         assert (tmp_path / "again" / file).read_bytes() == (published.parent / file).read_bytes()
 
 
+def test_where_a_readers_files_lie_is_no_difference(published):
+    def reading(**settings):
+        configuration = dataclasses.replace(manifest.configuration, reader_settings=settings)
+        return dataclasses.replace(manifest, configuration=configuration)
+
+    manifest = dataclasses.replace(Manifest.read(published), methods=())
+    reading(head="/there/head.npz").check_same(reading(head="/here/head.npz"), {}, published)
+    with pytest.raises(InputError, match="reader_settings.exclude: expected 2, as in this run, found 3"):
+        reading(exclude="3").check_same(reading(exclude="2"), {}, published)
+
+
 def test_protocols_missing_or_of_another_run_are_refused(published):
     own = Manifest.read(published).protocols
     first, second = (protocol_path(published.parent, each.hash) for each in own.values())

@@ -70,9 +70,16 @@ def test_an_avatar_of_other_settings_is_no_source(config, toy):
     runner.run(config)
     driven = replace(config, out=f"{config.out}-2", source=config.out)
     assert runner.run(driven).rows.failed == []
-    settings = {"toy": {"level": 0.9}}
-    with pytest.raises(InputError, match="expected an avatar of the settings of this run"):
-        runner.run(replace(driven, out=f"{config.out}-3", settings=settings))
+    for setting, key in (
+        ({"level": 0.9}, "config.level"),
+        ({"budget": {"iterations": 7}}, "budget.iterations"),
+    ):
+        with pytest.raises(InputError, match=f"method.{key}: expected an avatar of the settings of this run"):
+            runner.run(replace(driven, out=f"{config.out}-3", settings={"toy": setting}))
+    with pytest.raises(
+        InputError, match="avatar: expected a stored avatar, found none"
+    ):  # it used another run's
+        runner.run(replace(driven, out=f"{config.out}-4", source=driven.out))
 
 
 def test_labels_of_methods_and_conditions_do_not_collide(config, toy, monkeypatch):

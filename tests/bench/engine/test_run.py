@@ -318,6 +318,8 @@ def test_the_command_measures_more_of_the_avatars_of_a_run(config, kept, toy, ca
     assert cli.main(words) == 2
     assert "configuration.reader: expected names that run no code of others" in capsys.readouterr().err
     named = ["--methods", ",".join(BOTH["methods"]), "--set", "reader=toy_plugin:READER"]
+    assert cli.main([*words[:3], *words[5:], *named]) == 2  # the source is no folder to write
+    assert "out: expected --out" in capsys.readouterr().err
     assert cli.main([*words, *named]) == 0
     rows = pd.read_parquet(RunFolder(Path(f"{config.out}-more")).rows)
     assert {*zip(rows["method"], rows["condition"])} == {("toy", ""), ("toy", "half"), ("mirror", "")}
@@ -340,6 +342,22 @@ def test_a_damaged_record_is_refused_and_named(config, kept, refuses, name):
     path, match = DAMAGE[name]
     (Path(config.out) / path).write_text("noise")
     refuses(config, match)
+
+
+@pytest.mark.parametrize("measured", [None, 1])
+def test_rows_that_cannot_be_read_are_measured_again(config, kept, toy, cell, measured):
+    """Of a measured cell, and of one whose last metrics are still to be measured."""
+    rows = kept(config)
+    cell.update(measured=cell.record["measured"][:measured])
+    cell.rows.write_bytes(cell.rows.read_bytes()[:100])
+    assert rows_of(config).equals(rows)
+    assert toy.FITS == []
+
+
+def test_a_method_of_another_name_is_refused(config, kept, refuses, toy, monkeypatch):
+    kept(config)
+    monkeypatch.setattr(toy, "METHOD", replace(toy.METHOD, name="toy2"))
+    refuses(config, "methods: expected toy, as in this run, found toy2")
 
 
 def test_a_cell_of_other_inputs_or_none_is_not_overwritten(config, kept, cell, refuses):
