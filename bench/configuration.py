@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import math
-import types
-import typing
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_type_hints
+
+from typing_extensions import TypedDict
 
 from .errors import InputError
-from .io.documents import parse_setting, read_yaml, shown
+from .io.documents import parse_setting, read_yaml, settings_of
 from .io.files import expand_home
 from .registry import unknown
 
@@ -66,29 +65,9 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
         File or option of the values, for error messages.
     prefix : str
         Dotted path of ``values`` in the source.
-
-    Raises
-    ------
-    InputError
-        A key is unknown or missing, or a value has the wrong type.
     """
-    if not isinstance(values, Mapping):
-        raise InputError(source, prefix.rstrip("."), "a group of settings", shown(values))
-    hints = get_type_hints(cls)
-    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
-    arguments: dict[str, Any] = {}
-    for key, value in values.items():
-        if key not in fields:
-            raise unknown(source, f"{prefix}{key}", str(key), fields)
-        arguments[key] = _convert(hints[key], value, source, f"{prefix}{key}")
-    for name, field in fields.items():
-        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        if required and name not in arguments:
-            raise InputError(source, f"{prefix}{name}", "a value", "nothing")
-    try:
-        return cls(**arguments)
-    except ValueError as error:
-        raise InputError(source, prefix.rstrip(".") or cls.__name__, "valid settings", str(error)) from error
+    built: T = settings_of(values, cls, source, prefix)
+    return built
 
 
 def build_folder(cls: type[T], folder: Path) -> dict[str, T]:
@@ -144,82 +123,11 @@ def build_arguments(
     `InputError` as `build` does.
     """
     parameters = list(inspect.signature(function).parameters.values())[1:]
-    known = {p.name for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)} - {*harness}
-    anything = any(p.kind == p.VAR_KEYWORD for p in parameters)
+    names = {p.name for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)} - {*harness}
+    for key in values.keys() & {*harness}:
+        raise unknown(source, key, key, names)
     hints = get_type_hints(function)
-    arguments = {}
-    for key, value in values.items():
-        if key not in known and not (anything and key not in harness):
-            raise unknown(source, key, str(key), known)
-        arguments[key] = _convert(hints.get(key, Any) if key in known else Any, value, source, key)
+    kind = TypedDict("Arguments", {name: hints.get(name, Any) for name in names}, total=False)  # type: ignore[operator]
+    others = any(p.kind == p.VAR_KEYWORD for p in parameters)
+    arguments: dict[str, Any] = settings_of(values, kind, source, others=others)
     return arguments
-
-
-def _convert(hint: Any, value: Any, source: str, key: str) -> Any:
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin is typing.Literal:
-        if value not in arguments:
-            raise unknown(source, key, str(value), [str(a) for a in arguments])
-        return value
-    if origin in (Union, types.UnionType):
-        if value is None and type(None) in arguments:
-            return None
-        refusals = []
-        for candidate in (a for a in arguments if a is not type(None)):
-            try:
-                return _convert(candidate, value, source, key)
-            except InputError as error:
-                refusals.append(error)
-        if len(refusals) == 1:
-            raise refusals[0]
-        raise InputError(source, key, " or ".join(error.expected for error in refusals), shown(value))
-    if origin is Sequence:
-        origin, arguments = tuple, (*arguments, Ellipsis)
-    if origin is tuple:
-        if isinstance(value, str):
-            parts = [part.strip() for part in value.split(",") if part.strip()]
-            value = [
-                parse_setting(part, source, key) if part[0] in "+-.0123456789" else part for part in parts
-            ]
-        if not isinstance(value, (list, tuple)):
-            raise InputError(source, key, "a list", shown(value))
-        repeated = len(arguments) == 2 and arguments[1] is Ellipsis
-        if not repeated and len(arguments) != len(value):
-            raise InputError(source, key, f"{len(arguments)} values", f"{len(value)}")
-        kinds = [arguments[0]] * len(value) if repeated else arguments
-        return tuple(_convert(k, v, source, f"{key}[{i}]") for i, (k, v) in enumerate(zip(kinds, value)))
-    if origin in (dict, Mapping) or hint is dict:
-        if not isinstance(value, Mapping):
-            raise InputError(source, key, "a group of settings", shown(value))
-        if arguments and dataclasses.is_dataclass(arguments[1]):
-            return {
-                name: _convert(arguments[1], each, source, f"{key}.{name}") for name, each in value.items()
-            }
-        return dict(value)
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        if isinstance(value, hint):
-            return value
-        return build(hint, value, source, f"{key}.")
-    return _convert_scalar(hint, value, source, key)
-
-
-def _convert_scalar(hint: Any, value: Any, source: str, key: str) -> Any:
-    if hint is Any:
-        return value
-    if hint is bool and isinstance(value, bool):
-        return value
-    if hint is int and not isinstance(value, bool):
-        if isinstance(value, int):
-            return value
-        if isinstance(value, float) and value.is_integer():
-            return int(value)
-    if hint is float and not isinstance(value, bool) and isinstance(value, (int, float)):
-        if math.isfinite(value):
-            return float(value)
-        raise InputError(source, key, "a finite number", str(value))
-    if hint in (str, Path) and isinstance(value, (str, Path)):
-        return hint(value)
-    if hint is str and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return str(value)
-    names = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
-    raise InputError(source, key, names.get(hint, getattr(hint, "__name__", str(hint))), shown(value))

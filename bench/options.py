@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, Field, fields
 from typing import Any, NamedTuple, get_type_hints
 
 import tyro
@@ -14,8 +14,7 @@ from .errors import InputError
 class DependentOptions(NamedTuple):
     """Options that have an effect only if another setting has certain values.
 
-    A dataclass of settings lists its own in the class variable ``dependent``. Whether an option is given is read from the
-    words of the command line: its default stays in the dataclass, and an option that is given its default is refused, too.
+    A dataclass of settings lists its own in the class variable ``dependent``.
 
     Attributes
     ----------
@@ -31,22 +30,22 @@ class DependentOptions(NamedTuple):
     values: tuple[str, ...] | bool = True
 
 
-def given_options(words: Sequence[str], settings: type) -> dict[str, str]:
-    """The attributes of ``settings`` given as options on the command line, and their names in errors."""
-    named = {word[2:].partition("=")[0].replace("-", "_") for word in words if word.startswith("--")}
-    return {field.name: _option(field.name) for field in fields(settings) if field.name in named}
-
-
-def check_dependent(dependent: Iterable[DependentOptions], given: Mapping[str, str], settings: Any) -> None:
+def check_dependent(
+    dependent: Iterable[DependentOptions], settings: Any, given: Mapping[str, str] | None = None
+) -> None:
     """Raise `InputError` for an option that is given and has no effect with the other settings.
 
     Parameters
     ----------
-    given : Mapping[str, str]
-        Given attributes, and their names in the error.
     settings : Any
-        Settings with the attributes `DependentOptions.other`.
+        Dataclass with the attributes `DependentOptions.other`.
+    given : Mapping[str, str] | None
+        Given attributes and their names in the error; None for those that differ from their defaults.
     """
+    if given is None:
+        given = {
+            f.name: _option(f.name) for f in fields(settings) if getattr(settings, f.name) != _default(f)
+        }
     for options, other, values in dependent:
         value, name = getattr(settings, other), _shown(settings, other)
         present = value not in (None, False, "", ())
@@ -60,6 +59,10 @@ def check_dependent(dependent: Iterable[DependentOptions], given: Mapping[str, s
         for option in (option for option in options if option in given):
             wanted = f"{expected}, {relation} which it has no effect"
             raise InputError("command line", given[option], wanted, found)
+
+
+def _default(field: Field[Any]) -> Any:
+    return field.default if field.default_factory is MISSING else field.default_factory()
 
 
 def _option(name: str) -> str:

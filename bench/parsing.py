@@ -18,7 +18,7 @@ import tyro
 from .errors import ExitCode, HeadbenchError
 from .io.files import check_kind, expand_home, to_jsonable
 from .io.lock import locked
-from .options import check_dependent, given_options
+from .options import check_dependent
 from .process import environment_variable
 from .progress import log_to_terminal, progress
 from .registry import Plugin, discover, get, resolve
@@ -66,7 +66,7 @@ def _parse(command: Any, program: str, words: Sequence[str]) -> Any:
 
 
 def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
-    """The command as a function of its settings, for the parser. ``words`` determine which options are given."""
+    """The command as a function of its settings, for the parser."""
     try:
         spec: CommandSpec = get("commands", name)
         settings_class = resolve(spec.settings)
@@ -80,8 +80,7 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
         return lambda: run(settings, json)
 
     def run(settings: Any, json: bool) -> int:
-        dependent = getattr(settings_class, "dependent", ())
-        check_dependent(dependent, given_options(words, settings_class), settings)
+        check_dependent(getattr(settings_class, "dependent", ()), settings)
         folder = getattr(settings, spec.writes) if spec.writes else None
         if folder:
             check_kind(Path(folder), *spec.kinds)

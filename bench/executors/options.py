@@ -53,7 +53,7 @@ def chosen_execution(
     )  # otherwise `build` refuses them
     execution = build(Execution, values, source, "execution.")
     given = {key: f"--set execution.{key}" for key in assigned} | {key: f"--{key}" for key in options}
-    check_dependent(DEPENDENT, given, execution)
+    check_dependent(DEPENDENT, execution, given)
     return execution
 
 

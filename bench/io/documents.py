@@ -142,9 +142,23 @@ def checked(value: Any, kind: type[T], source: Source, prefix: str = "", *, fore
         extra = "ignore" if foreign else "forbid"
         return _validator(kind).validate_json(text, strict=True, extra=extra)  # type: ignore[arg-type]
     except ValidationError as error:
-        _refuse(error.errors(include_url=False)[0], kind, source, prefix)
+        _refuse(error.errors(include_url=False), kind, source, prefix)
     except (TypeError, ValueError) as error:
         raise InputError(source, prefix, "plain values", str(error)) from error
+
+
+def settings_of(value: Any, kind: Any, source: Source, prefix: str = "", *, others: bool = False) -> Any:
+    """Build a dataclass or typed dictionary of settings from a value that a person wrote.
+
+    As `checked`, but ``1e4`` is a whole number, a number is text where text is expected, and ``a,b`` is a list. With
+    ``others``, unknown entries of a typed dictionary are kept.
+    """
+    from pydantic import ValidationError
+
+    try:
+        return _settings_validator(kind).validate_python(value, extra="allow" if others else "forbid")
+    except ValidationError as error:
+        _refuse(error.errors(include_url=False), kind, source, prefix)
 
 
 def shown(value: Any) -> str:
@@ -162,6 +176,64 @@ def _validator(kind: Any) -> Any:
     from pydantic import TypeAdapter  # takes a third of the start-up time of the command line
 
     return TypeAdapter(kind)
+
+
+_CHOICE = "|"
+"""Place of an error in an alternative of a union."""
+
+
+@functools.cache
+def _settings_validator(kind: Any) -> Any:
+    from pydantic_core import SchemaValidator
+
+    return SchemaValidator(_for_settings(_validator(kind).core_schema))
+
+
+def _for_settings(schema: Any) -> Any:
+    """The schema of a type with the conversions of `settings_of`."""
+    if isinstance(schema, list):
+        return [_for_settings(each) for each in schema]
+    if not isinstance(schema, dict):
+        return schema
+    kept = ("metadata", "serialization", "default", "json_schema")
+    schema = {key: each if key in kept else _for_settings(each) for key, each in schema.items()}
+    convert: Any = None
+    match schema.get("type"):
+        case "json-or-python" if schema["json_schema"]["type"] == "list":  # Sequence
+            items = _for_settings(schema["json_schema"]["items_schema"])
+            return _for_settings({"type": "tuple", "items_schema": [items], "variadic_item_index": 0})
+        case "union":
+            choices = [(each, _CHOICE) for each in schema["choices"]]
+            return {**schema, "choices": choices, "mode": "left_to_right"}
+        case "str":
+            return {**schema, "coerce_numbers_to_str": True}
+        case "bool":
+            return {**schema, "strict": True}
+        case "float":
+            return {**schema, "strict": True, "allow_inf_nan": False}
+        case "int":
+            schema, convert = {**schema, "strict": True}, _whole
+        case "tuple":
+            convert = _listed
+    if convert is None:
+        return schema
+    return {
+        "type": "function-before",
+        "function": {"type": "no-info", "function": convert},
+        "schema": schema,
+    }
+
+
+def _whole(value: Any) -> Any:
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _listed(value: Any) -> Any:
+    """The parts of ``a,b``; those that begin like a number are parsed."""
+    if not isinstance(value, str):
+        return value
+    parts = [part.strip() for part in value.split(",") if part.strip()]
+    return [parse_setting(part, "", "") if part[0] in "+-.0123456789" else part for part in parts]
 
 
 def read_text(path: Path, what: str) -> str:
@@ -222,16 +294,47 @@ def _entries(kind: Any, place: Sequence[str | int]) -> list[str]:
     return list(getattr(kind, "__annotations__", {}))
 
 
-def _refuse(error: Any, kind: Any, source: Source, prefix: str) -> NoReturn:
-    """Raise the first error of pydantic as an `InputError`."""
-    place = [part for part in error["loc"] if part != "[key]"]
+_EXPECTED = {
+    "missing": "a value",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "bool_type": "true or false",
+    "string_type": "text",
+    "path_type": "a path",
+    "tuple_type": "a list",
+    "dict_type": "a group of settings",
+    "dataclass_type": "a group of settings",
+    "value_error": "valid values",
+}
+"""Types of pydantic's errors."""
+
+
+def _refuse(errors: Sequence[Any], kind: Any, source: Source, prefix: str) -> NoReturn:
+    """Raise the first error of pydantic, or those of all alternatives of its union, as an `InputError`."""
+    error, first = errors[0], errors[0]["loc"]
+    if _CHOICE in first:
+        before = first[: first.index(_CHOICE)]
+        errors = [each for each in errors if each["loc"][: len(before)] == before]
+        error = max(errors, key=lambda each: len(each["loc"]))
+    else:
+        errors = errors[:1]
+    place = [part for part in error["loc"] if part not in ("[key]", _CHOICE)]
     key = prefix.rstrip(".")
     for part in place:
         key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else part
     if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
         raise unknown(str(source), key, str(place[-1]), _entries(kind, place[:-1]))
+    names = re.findall(r"'([^']*)'", error["ctx"]["expected"]) if error["type"] == "literal_error" else ()
+    if names and isinstance(error["input"], str) and len(errors) == 1:
+        raise unknown(str(source), key, error["input"], names)
+    found = shown(error["input"])
     if error["type"] == "missing":
-        raise InputError(source, key, "a value", "nothing")
-    if error["type"] == "value_error":
-        raise InputError(source, key, "valid values", error["msg"].removeprefix("Value error, "))
-    raise InputError(source, key, error["msg"].removeprefix("Input should be "), shown(error["input"]))
+        found = "nothing"
+    elif error["type"] == "value_error":
+        found = error["msg"].removeprefix("Value error, ")
+    same = [each for each in errors if len(each["loc"]) == len(error["loc"])]
+    expected = dict.fromkeys(
+        _EXPECTED.get(each["type"], each["msg"].removeprefix("Input should be ")) for each in same
+    )
+    raise InputError(source, key, " or ".join(expected), found)

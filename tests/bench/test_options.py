@@ -13,9 +13,8 @@ UNION = "prepare nersemble --union-root unions"
 RUN = "run --data d --out out"
 NO_EFFECT = "without which it has no effect, found"
 CASES = [
-    # An option at its default counts, too.
-    (f"{COMPACT} --scale=1", f"--scale: expected --compare, {NO_EFFECT} none"),
-    (f"{RENDER} --frames train --beyond 30", f"--beyond: expected --frames orbit, {NO_EFFECT} --frames train"),
+    (f"{COMPACT} --scale=2", f"--scale: expected --compare, {NO_EFFECT} none"),
+    (f"{RENDER} --frames train --beyond 31", f"--beyond: expected --frames orbit, {NO_EFFECT} --frames train"),
     (f"{RENDER} --beside", f"--beside: expected --video, {NO_EFFECT} none"),
     (f"{RENDER} --frames orbit --video --beside", "--beside: expected --frames self_reenactment"),
     (f"{EVALUATE} --like r --tasks novel_view", "--tasks: expected no --like, with which it has no effect, found --like r"),
@@ -33,15 +32,15 @@ CASES = [
     ("compare run --baseline b --captures same", f"--captures: expected --update, {NO_EFFECT} none"),
     ("compare run --baseline b --update --judge-speed", "--judge-speed: expected no --update"),
     *((f"{export} --timestep 3", f"--timestep: expected --capture, {NO_EFFECT} none") for export in (PLY, GLB, SOG)),
-    (f"{HTML} --cy auto", f"--cy: expected --capture, {NO_EFFECT} none"),
+    (f"{HTML} --cy top", f"--cy: expected --capture, {NO_EFFECT} none"),
     (f"{IMPORT} --cy top", f"--cy: expected --capture, {NO_EFFECT} none"),
     (f"{IMPORT} --capture c --subject s", "--subject: expected no --capture"),
     ("export colmap c --out out --all-timesteps --timesteps 1", "--timesteps: expected no --all-timesteps"),
     (f"{UNION} --check", "--check: expected no --union-root"),
     ("prepare nersemble --root r --rejoin", f"--rejoin: expected --union-root, {NO_EFFECT} none"),
     ("lint --list --strict", "--strict: expected no --list"),
-    ("lint c --thorough --views 48", "--views: expected no --thorough"),
-    ("run parity ga --checkout c --out out --data d --size 96x136", "--size: expected no --data"),
+    ("lint c --thorough --views 49", "--views: expected no --thorough"),
+    ("run parity ga --checkout c --out out --data d --size 96x138", "--size: expected no --data"),
     ("run parity ga --checkout c --out out --samples 5000", f"--samples: expected METHOD flashavatar or gbs or rgbavatar, {NO_EFFECT} METHOD ga"),
     ("frames c --out out --trust", "--trust: expected a run, with run.json, at c"),
     ("doctor check x:SPEC --reader ga", f"--reader: expected --data, {NO_EFFECT} none"),
