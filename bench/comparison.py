@@ -31,8 +31,7 @@ from .engine.config import (
     with_methods,
 )
 from .errors import HeadbenchError, InputError
-from .executors.options import chosen_execution
-from .executors.settings import Execution, ExecutorName
+from .executors.settings import Execution, ExecutorName, chosen_execution
 from .io.documents import read_yaml
 from .io.files import (
     check_kind,

@@ -76,6 +76,10 @@ class InputError(HeadbenchError):
         message = f"{where}: expected {self.expected}, found {self.found}."
         super().__init__(f"{message} {self.remedy}" if remedy else message)
 
+    def __reduce__(self) -> tuple[type, tuple[str, ...]]:
+        """Between processes."""
+        return type(self), (self.file, self.key, self.expected, self.found, self.remedy)
+
 
 def text_of(error: BaseException) -> str:
     """The message of an error, or its type if the class fails to provide the message."""

@@ -35,8 +35,8 @@ from ..engine.run import run
 from ..engine.store import Cell
 from ..engine.stored import avatar_digest, open_avatar
 from ..errors import HeadbenchError, InputError
-from ..executors.options import ExecutionOptions
-from ..executors.remote import run_as_task
+from ..executors.schedule import run_as_task
+from ..executors.settings import ExecutionOptions
 from ..io.files import (
     atomic_path,
     check_name,

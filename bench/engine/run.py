@@ -21,11 +21,9 @@ import numpy as np
 from ..condition import Condition, label_of
 from ..contracts import Clip
 from ..errors import HeadbenchError, InputError, LeftOutError, UnavailableError, reason_of, shortened
-from ..executors.outcome import read_outcome
 from ..executors.schedule import DAMAGED, Schedule
 from ..executors.settings import Execution, check_executor
-from ..executors.task import Task
-from ..executors.worker import FULL_DISK
+from ..executors.task import FULL_DISK, Task, read_outcome
 from ..io.files import check_kind, check_output_folder
 from ..io.lock import locked
 from ..live import Position

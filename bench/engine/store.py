@@ -28,7 +28,7 @@ from typing_extensions import TypedDict
 
 from ..contracts import Clip, FrameKey
 from ..errors import InputError
-from ..executors.outcome import TaskOutcome, read_record, record_path, update_record
+from ..executors.task import TaskOutcome, read_record, record_path, update_record
 from ..io.documents import checked
 from ..manifest import Manifest
 from ..rows import Rows

@@ -4,44 +4,69 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import shutil
 import signal
 from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
+from ..configuration import build
+from ..errors import HeadbenchError
+from ..io.documents import checked, read_json
+from ..io.files import write_json
+from ..io.lock import locked
 from ..machine import processor_count
 from ..process import environment_variable
 from ..progress import TasksLeft, progress
+from ..registry import resolve
+from ..specs import CommandResult
 from ..start import end_with_parent, starting_workers
-from .outcome import TaskOutcome, forget_outcome, read_outcome, write_outcome
-from .results import Executor, TaskResult
-from .settings import Execution
+from .settings import Execution, ExecutionOptions, check_executor
 from .slurm import Slurm
-from .task import TASK_LOG, Task
-from .worker import execute_task
+from .task import (
+    TASK_LOG,
+    Executor,
+    Task,
+    TaskResult,
+    execute_task,
+    forget_outcome,
+    read_outcome,
+    update_record,
+)
 
-STOP_S, POLL_S = 5.0, 1.0
-"""Time for a worker to terminate, and between updates of the progress, seconds."""
+POLL_S = 1.0
+"""Seconds between updates of the progress."""
+RESULT = "result.json"
+PLACE = "command"
+log = logging.getLogger(__name__)
+DAMAGED = "its results are missing or damaged"
+Failures = dict[str, str]
+"""Reasons of failed tasks, by their folder."""
 
 
-@dataclass(eq=False)
-class _Process:
-    process: Any
-    connection: Connection
-    task: Task | None = None
+class _Slot:
+    """A worker process, which executes one task after another; a killed one breaks only its own pool."""
 
-    def stop(self) -> None:
-        """Close the connection, which ends the worker, and kill the worker if it is still alive after `STOP_S`."""
-        self.connection.close()
-        self.process.join(STOP_S)
-        if self.process.is_alive():
-            self.process.kill()
-            self.process.join()
+    def __init__(self, threads: int | None):
+        # Libraries read the variable when they are imported. The pool starts its process when it is first used.
+        number = None if threads is None else str(threads)
+        before = {*multiprocessing.active_children()}
+        context = multiprocessing.get_context("spawn")
+        self.pool = ProcessPoolExecutor(1, context, _start_worker)
+        with starting_workers(), environment_variable("OMP_NUM_THREADS", number):
+            self.pool.submit(int)
+        (self.process,) = {*multiprocessing.active_children()} - before
+        self.task: Task | None = None
+        self.future: Future[None] = Future()
+
+    def execute(self, task: Task) -> None:
+        self.task, self.future = task, self.pool.submit(execute_task, task)
 
 
 class Processes:
@@ -58,91 +83,73 @@ class Processes:
     def __init__(self, workers: int, threads: int | None):
         self._count, self._threads = workers, threads
         self._waiting: deque[Task] = deque()
-        self._processes: list[_Process] = []
+        self._slots: list[_Slot] = []
 
     @property
     def running(self) -> Sequence[Task]:
         """The running tasks."""
-        return [process.task for process in self._processes if process.task is not None]
+        return [slot.task for slot in self._slots if slot.task is not None]
 
     def submit(self, tasks: Sequence[Task]) -> None:
         """Execute these tasks, in order, after those already queued."""
         for task in tasks:
             forget_outcome(task.folder, task.speed)
         self._waiting.extend(tasks)
+        self._fill()
 
     def poll(self, seconds: float) -> list[TaskResult]:
         """Wait at most ``seconds`` for a task to end; return the results of those that ended."""
+        busy = [slot for slot in self._slots if slot.task is not None]
+        done = wait([slot.future for slot in busy], min(seconds, POLL_S), FIRST_COMPLETED).done
+        results = [self._result(slot) for slot in busy if slot.future in done]
         self._fill()
-        connections = [p.connection for p in self._processes if p.task is not None]
-        ready = wait(connections, min(seconds, POLL_S))
-        ended = [self._ended(p) for p in list(self._processes) if p.connection in ready]
-        self._fill()
-        return ended
+        return results
 
     def close(self) -> None:
         """Terminate all workers; their tasks resume from checkpoints when started again."""
-        for process in self._processes:
-            process.process.terminate()
-        for process in self._processes:
-            process.stop()
-        self._processes = []
+        for slot in self._slots:
+            slot.process.terminate()
+        for slot in self._slots:
+            slot.pool.shutdown()
+        self._slots = []
 
     def _fill(self) -> None:
         """Assign queued tasks to idle workers."""
-        idle = [process for process in self._processes if process.task is None]
-        while self._waiting and (idle or len(self._processes) < self._count):
-            process = idle.pop() if idle else self._start()
-            process.task = self._waiting.popleft()
-            process.connection.send(process.task)
+        while self._waiting:
+            slot = next((slot for slot in self._slots if slot.task is None), None)
+            if slot is None:
+                if len(self._slots) == self._count:
+                    return
+                slot = _Slot(self._threads)
+                self._slots.append(slot)
+            try:
+                slot.execute(self._waiting[0])
+            except BrokenProcessPool:  # killed while it was idle
+                self._remove(slot)
+            else:
+                self._waiting.popleft()
 
-    def _ended(self, process: _Process) -> TaskResult:
-        assert process.task is not None
-        task, process.task = process.task, None
+    def _result(self, slot: _Slot) -> TaskResult:
+        assert slot.task is not None
+        task, slot.task = slot.task, None
         try:
-            error = process.connection.recv()
-        except (EOFError, OSError):
-            self._processes.remove(process)
-            process.process.join()
-            process.connection.close()
-            return TaskResult(task, f"its process was ended by {_cause(process.process.exitcode)}")
-        if error is not None:
-            raise error
+            slot.future.result()
+        except BrokenProcessPool:
+            self._remove(slot)
+            return TaskResult(task, f"its process was ended by {_cause(slot.process.exitcode)}")
         outcome = read_outcome(task.folder)
         if task.device != "cpu" and outcome is not None and outcome["status"] == "failed":
-            self._processes.remove(process)  # After a CUDA error, all further CUDA calls of its process fail.
-            process.stop()
+            self._remove(slot)  # after a CUDA error, all further CUDA calls of its process fail
         return TaskResult(task)
 
-    def _start(self) -> _Process:
-        ours, theirs = multiprocessing.Pipe()
-        process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs,))
-        threads = (
-            None if self._threads is None else str(self._threads)
-        )  # libraries read it when they are imported
-        with starting_workers(), environment_variable("OMP_NUM_THREADS", threads):
-            process.start()
-        theirs.close()
-        started = _Process(process, ours)
-        self._processes.append(started)
-        return started
+    def _remove(self, slot: _Slot) -> None:
+        self._slots.remove(slot)
+        slot.pool.shutdown()
 
 
-def _serve(connection: Connection) -> None:
-    """Execute tasks until the connection is closed."""
+def _start_worker() -> None:
     end_with_parent()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    while True:
-        try:
-            task: Task = connection.recv()
-        except EOFError:
-            return
-        error = None
-        try:
-            execute_task(task)
-        except Exception as raised:  # noqa: BLE001 - the other process reports it
-            error = raised
-        connection.send(error)
 
 
 def _cause(code: int | None) -> str:
@@ -152,42 +159,23 @@ def _cause(code: int | None) -> str:
     return f"exit code {code}"
 
 
-log = logging.getLogger(__name__)
-DAMAGED = "its results are missing or damaged"
-Failures = dict[str, str]
-"""Reasons of failed tasks, by their folder."""
-
-
 @dataclass(frozen=True)
 class Schedule:
-    """Tasks of one kind.
-
-    Attributes
-    ----------
-    label : str
-        Common name of the tasks in progress messages.
-    is_done : Callable
-        Whether the results of a task with a successful outcome exist and are complete.
-    execution : Execution
-        Execution settings; any executor except "inline".
-    speed : bool
-        Whether the tasks measure speed, one at a time with all threads, see `Task.speed`.
-    """
+    """Tasks of one kind."""
 
     label: str
+    """Common name of the tasks in progress messages."""
     is_done: Callable[[Task], bool]
+    """Whether the results of a task with a successful outcome exist and are complete."""
     execution: Execution
+    """Execution settings; any executor except "inline"."""
     speed: bool = False
+    """Whether the tasks measure speed, one at a time with all threads, see `Task.speed`."""
 
     def run_all(self, tasks: Sequence[Task]) -> Failures:
         """Run the tasks, all of one root folder that the caller has locked; return the failures by folder.
 
-        Raises
-        ------
-        InputError
-            Slurm refuses jobs.
-        OSError
-            The disk is full or read-only; no task is marked as failed.
+        A full or read-only disk is an `OSError`, and no task is marked as failed.
         """
         failures: Failures = {}
         if not tasks:
@@ -198,13 +186,13 @@ class Schedule:
             executor.submit(tasks)
             done = 0
             while done < len(tasks):
-                for ended in executor.poll(self.execution.poll_s):
-                    again = self._again(ended, failures)
+                for result in executor.poll(self.execution.poll_s):
+                    again = self._again(result, failures)
                     if again is not None:
                         executor.submit([again])
                     else:
                         done += 1
-                        left.end(ended.task.place)
+                        left.end(result.task.place)
                 running = executor.running
                 left.running([task.place for task in running])
                 note = f"{len(running)} running" + (f", {len(failures)} failed" if failures else "")
@@ -220,9 +208,9 @@ class Schedule:
         workers = min(self.execution.workers or (cores if device == "cpu" else 1), tasks)
         return Processes(workers, self.execution.threads or max(1, cores // workers))
 
-    def _again(self, ended: TaskResult, failures: Failures) -> Task | None:
+    def _again(self, result: TaskResult, failures: Failures) -> Task | None:
         """The task to submit again after one ended; None if it is done, or failed and recorded as such."""
-        task = ended.task
+        task = result.task
         outcome = read_outcome(task.folder)
         reason = ""
         if outcome is not None and outcome["speed"] == self.speed:
@@ -230,14 +218,14 @@ class Schedule:
                 return None
             reason = outcome.get("reason", "") if outcome["status"] == "failed" else ""
         if not reason:
-            lost = ended.lost or DAMAGED
-            if ended.again and task.restarts < self.execution.restarts:
+            lost = result.lost or DAMAGED
+            if result.again and task.restarts < self.execution.restarts:
                 log.warning("%s: %s; it is started again", task.place, lost)
                 return replace(task, restarts=task.restarts + 1)
             reason = f"HeadbenchError: {lost}" + (f", {task.restarts + 1} times" if task.restarts else "")
             # The process ended before it could record this.
-            known: TaskOutcome = outcome or {"status": "failed", "speed": self.speed}
-            write_outcome(task.folder, {**known, "status": "failed", "speed": self.speed, "reason": reason})
+            failed = {**(outcome or {}), "status": "failed", "speed": self.speed, "reason": reason}
+            update_record(task.folder, task=failed)
         failures[task.place] = reason
         log.error("%s failed: %s; see %s", task.place, reason, task.folder / TASK_LOG)
         return None
@@ -245,8 +233,49 @@ class Schedule:
 
 def _activities(tasks: Sequence[Task]) -> dict[str, str]:
     """What each running task does, by its name, as its process or job has recorded."""
-    found = {}
+    steps = {}
     for task in tasks:
         outcome = read_outcome(task.folder)
-        found[task.name or task.place] = "starting" if outcome is None else outcome.get("doing", "starting")
-    return found
+        steps[task.name or task.place] = "starting" if outcome is None else outcome.get("doing", "starting")
+    return steps
+
+
+def run_as_task(function: str, settings: ExecutionOptions, folder: Path, device: str) -> CommandResult:
+    """Run ``function`` ("module:name" of a command) with its settings by their executor; return its result.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder for the log and the result, which is removed at the end.
+    """
+    execution = settings.execution
+    check_executor(execution, device)
+    kind = f"{type(settings).__module__}:{type(settings).__name__}"
+    folder = folder.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    task = Task.of(
+        folder, PLACE, f"{__name__}:execute_command", command=function, kind=kind, settings=settings.others
+    )
+    result = folder / PLACE / RESULT
+    result.unlink(missing_ok=True)
+    with locked(folder):
+        failed = Schedule("command", lambda task: result.is_file(), execution).run_all(
+            [replace(task, device=device)]
+        )
+    for reason in failed.values():
+        raise HeadbenchError(f"{reason} Its log is {folder / PLACE / TASK_LOG}.")
+    values = checked(read_json(result), dict[str, Any], result)
+    shutil.rmtree(folder)
+    return CommandResult(**values)
+
+
+def execute_command(task: Task, report: Callable[[str], None]) -> None:
+    """Run the command of a task in this process and write its result."""
+    given = task.arguments
+    settings = build(resolve(given["kind"]), given["settings"], "settings of the task")
+
+    def progress(done: int, total: int, note: str = "") -> None:
+        report(f"{done} of {total} {note}")
+
+    result = resolve(given["command"])(settings, progress)
+    write_json(task.folder / RESULT, result._asdict())

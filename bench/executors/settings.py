@@ -1,49 +1,44 @@
-"""Settings for executing the cells of a run: in this process, in worker processes, or as cluster jobs."""
+"""Settings for executing the cells of a run: in this process, in worker processes, or as cluster jobs; and their options."""
 
 from __future__ import annotations
 
 import importlib
 import shutil
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Annotated, Any, Literal
 
+import tyro
+
+from ..configuration import build, merge, parse_assignments
 from ..errors import UnavailableError, install_extra
 from ..machine import check_device
+from ..options import DependentOptions, check_dependent
 from ..process import environment_variable
+from ..registry import unknown
 
 ExecutorName = Literal["inline", "processes", "slurm"]
 
 
 @dataclass(frozen=True)
 class SlurmSettings:
-    """Resources of a Slurm job; each executes one cell.
-
-    Attributes
-    ----------
-    partition : str | None
-        Partition; None for the cluster's default.
-    gpus, cpus, memory_gb, hours : int or float
-        Resources of each job. ``cpus`` is also its number of threads.
-    parallel : int
-        Maximum number of concurrent jobs of an array.
-    exclusive : bool
-        Whether jobs that measure speed request a whole node. Otherwise, concurrent jobs bias the
-        measurement.
-    setup : tuple[str, ...]
-        Shell commands to run at the start of a job, such as ``module load cuda``.
-    parameters : dict[str, Any]
-        Further options of ``sbatch`` by name, such as ``{"account": "vision", "qos": "long"}``.
-    """
+    """Resources of a Slurm job; each executes one cell."""
 
     partition: str | None = None
+    """Partition; None for the cluster's default."""
     gpus: int = 0
     cpus: int = 4
+    """Processors of each job, also its number of threads."""
     memory_gb: float = 8.0
     hours: float = 4.0
     parallel: int = 64
+    """Maximum number of concurrent jobs of an array."""
     exclusive: bool = True
+    """Whether jobs that measure speed request a whole node. Otherwise, concurrent jobs bias the measurement."""
     setup: tuple[str, ...] = ()
+    """Shell commands to run at the start of a job, such as ``module load cuda``."""
     parameters: dict[str, Any] = field(default_factory=dict)
+    """Further options of ``sbatch`` by name, such as ``{"account": "vision", "qos": "long"}``."""
 
     def __post_init__(self) -> None:
         """Refuse invalid settings."""
@@ -55,29 +50,18 @@ class SlurmSettings:
 
 @dataclass(frozen=True)
 class Execution:
-    """How the cells of a run are executed. None of these settings enters a fingerprint.
-
-    Attributes
-    ----------
-    executor : ExecutorName
-        ``inline``, sequentially in this process; ``processes``, in parallel on this machine;
-        ``slurm``, one job per cell.
-    workers : int | None
-        Number of ``processes``; None: one for each core.
-    threads : int | None
-        Threads of each worker; None divides the cores among the workers. Speed is measured with the
-        threads of this process.
-    restarts : int
-        Maximum number of restarts of a cell whose process or job was killed, lost or timed out.
-    poll_s : float
-        Interval between queries to Slurm, seconds.
-    """
+    """How the cells of a run are executed. None of these settings enters a fingerprint."""
 
     executor: ExecutorName = "inline"
+    """``inline``, sequentially in this process; ``processes``, in parallel on this machine; ``slurm``, one job per cell."""
     workers: int | None = None
+    """Number of ``processes``; None: one for each core."""
     threads: int | None = None
+    """Threads of each worker; None divides the cores among the workers. Speed is measured with the threads of this process."""
     restarts: int = 3
+    """Maximum number of restarts of a cell whose process or job was killed, lost or timed out."""
     poll_s: float = 5.0
+    """Interval between queries to Slurm, seconds."""
     slurm: SlurmSettings = field(default_factory=SlurmSettings)
 
     def __post_init__(self) -> None:
@@ -91,7 +75,7 @@ class Execution:
 
 
 def import_submitit() -> Any:
-    """Import submitit without letting it close open log files. Raises `UnavailableError`."""
+    """Import submitit without letting it close open log files."""
     try:
         with environment_variable("SUBMITIT_LOG_LEVEL", "NOCONFIG"):
             return importlib.import_module("submitit")
@@ -100,15 +84,9 @@ def import_submitit() -> Any:
 
 
 def check_executor(execution: Execution, device: str) -> None:
-    """Check that cells can be executed.
+    """Refuse a device that this machine lacks, and Slurm where jobs cannot be submitted.
 
-    Raises
-    ------
-    InputError
-        This machine has no such device. For Slurm, the jobs check it, since the submitting machine
-        may have none.
-    UnavailableError
-        Jobs cannot be submitted from this machine.
+    The jobs of Slurm check their device themselves, since the submitting machine may have none.
     """
     if execution.executor != "slurm":
         check_device(device)
@@ -118,3 +96,73 @@ def check_executor(execution: Execution, device: str) -> None:
         remedy = "Start this on a machine that submits to a cluster, or choose --executor processes."
         raise UnavailableError(f"Slurm is not here: there is no {', '.join(missing)}.", remedy)
     import_submitit()
+
+
+DEPENDENT = (
+    DependentOptions(("workers", "threads"), "executor", ("processes",)),
+    DependentOptions(("restarts",), "executor", ("processes", "slurm")),
+    DependentOptions(("poll_s", "slurm"), "executor", ("slurm",)),
+)
+"""Settings of `Execution` that apply to some executors only."""
+
+
+def chosen_execution(
+    settings: Mapping[str, Any],
+    assigned: Mapping[str, Any],
+    executor: ExecutorName | None,
+    workers: int | None,
+    source: str,
+) -> Execution:
+    """Settings of an executor, overridden by ``--set`` and by the options ``--executor`` and ``--workers``.
+
+    Parameters
+    ----------
+    settings : Mapping[str, Any]
+        All settings of ``execution``, including those in ``assigned``.
+    assigned : Mapping[str, Any]
+        Settings of ``execution`` given with ``--set``.
+    executor, workers : ExecutorName, int or None
+        Values of the options; None if not given.
+    source : str
+        File or option of the settings, for error messages.
+    """
+    options = {"executor": executor, "workers": workers}
+    options = {key: value for key, value in options.items() if value is not None}
+    # `build` refuses other values.
+    values = merge(settings, options) if isinstance(settings, Mapping) else settings
+    execution = build(Execution, values, source, "execution.")
+    given = {key: f"--set execution.{key}" for key in assigned} | {key: f"--{key}" for key in options}
+    check_dependent(DEPENDENT, execution, given)
+    return execution
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutionOptions:
+    """How a command is executed."""
+
+    executor: ExecutorName = "inline"
+    """Executor, as for `headbench run`."""
+
+    workers: int | None = None
+    """Number of processes, as for `headbench run`; only with `--executor processes`."""
+
+    set: Annotated[
+        tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="execution.KEY=VALUE")
+    ] = ()
+    """A setting of the executor, for example `execution.slurm.partition=gpu`; repeatable."""
+
+    @property
+    def execution(self) -> Execution:
+        """Execution settings."""
+        given = parse_assignments(self.set)
+        if stray := sorted(given.keys() - {"execution"}):
+            raise unknown("command line", "--set", stray[0], ["execution"])
+        executor = None if self.executor == "inline" else self.executor
+        settings = given.get("execution", {})
+        return chosen_execution(settings, settings, executor, self.workers, "command line")
+
+    @property
+    def others(self) -> dict[str, Any]:
+        """All settings except these, which do not affect the results."""
+        how = {field.name for field in fields(ExecutionOptions)}
+        return {name: value for name, value in asdict(self).items() if name not in how}

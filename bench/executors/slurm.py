@@ -9,6 +9,7 @@ import logging
 import os
 import re
 import subprocess
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,11 +21,8 @@ from typing_extensions import TypedDict
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.documents import checked, read_json
 from ..io.files import check_room, digest, write_json
-from .outcome import forget_outcome, read_outcome
-from .results import TaskResult
 from .settings import Execution, import_submitit
-from .task import Task
-from .worker import FULL_DISK, run_job
+from .task import FULL_DISK, Task, TaskResult, execute_task, forget_outcome, read_outcome
 
 log = logging.getLogger(__name__)
 MAX_ARRAY = 1000
@@ -182,7 +180,7 @@ class Slurm:
         state, reason, code = end_of(job.number)
         if state in FINAL and not (job.earlier and state == "CANCELLED"):  # a restart requests it again
             return TaskResult(job.task, f"job {job.number} {FINAL[state]}", again=False)
-        if code in FULL_DISK and not job.earlier:  # there may be space by now; see `worker.run_job`
+        if code in FULL_DISK and not job.earlier:  # there may be space by now; see `run_job`
             raise OSError(code, f"{os.strerror(code)} (job {job.number})", str(job.task.folder))
         check_room(self._root)  # a job that could not open its log leaves no reason
         return TaskResult(job.task, f"job {job.number} ended as {state}{reason}")
@@ -221,6 +219,29 @@ class Slurm:
             remedy = "`sinfo` lists partitions and what they have."
             found = " ".join(str(error).split()).replace("sbatch: error: ", "")
             raise InputError("execution.slurm", asked, "jobs that sbatch takes", found, remedy) from error
+
+
+def run_job(task: Task) -> None:
+    """Run a task in a separate job."""
+    os.chdir(task.directory)
+    sys.path += [entry for entry in task.path if entry not in sys.path]
+    try:
+        execute_task(task)
+    except OSError as error:
+        if error.errno not in FULL_DISK:
+            raise
+        print(f"{error.filename}: {error.strerror}", file=sys.stderr, flush=True)
+        os._exit(error.errno)  # the disk may be too full for its outcome and log
+
+
+def _continued(task: Task) -> Any:
+    """The job that submitit resubmits after a timeout: the same job, which resumes."""
+    from submitit.helpers import DelayedSubmission
+
+    return DelayedSubmission(run_job, task)
+
+
+run_job.__dict__["checkpoint"] = _continued
 
 
 def job_name(root: Path) -> str:

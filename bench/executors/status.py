@@ -1,4 +1,4 @@
-"""The state of a run's cells, from their files and, for Slurm jobs, from the queue."""
+"""``headbench status``: the state of a run's cells, from their files and, for Slurm jobs, from the queue."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from itertools import product
 from pathlib import Path
 from typing import Literal
 
+import tyro
+
+from ..contracts import Progress, no_progress
 from ..engine.store import RunFolder
 from ..errors import HeadbenchError
 from ..io.lock import is_locked
 from ..manifest import Manifest
 from ..progress import counted, duration
 from ..rows import ALL
-from ..specs import CommandResult
-from .outcome import TaskOutcome, read_outcome
+from ..specs import CommandResult, command
 from .slurm import Queued, queue, read_submitted
-from .task import TASK_LOG
+from .task import TASK_LOG, TaskOutcome, read_outcome
 
 log = logging.getLogger(__name__)
 State = Literal["waiting", "running", "done", "failed"]
@@ -57,9 +59,18 @@ class CellState:
         return f"{self.method}, subject {self.subject}, seed {self.seed}"
 
 
-def run_status(run: Path) -> CommandResult:
-    """Describe the cells of a run. Raises `InputError` for a folder that is not a run."""
-    folder = RunFolder(run)
+@command("status", group="compare")
+def status(run: tyro.conf.Positional[str], progress: Progress = no_progress) -> CommandResult:
+    """Show which cells of a run are waiting, running, done or failed.
+
+    Shows the progress of a run, or of a finished run. Exit code 1: a cell failed.
+
+    Parameters
+    ----------
+    run : str
+        Folder of the run.
+    """
+    folder = RunFolder(Path(run))
     cells = cell_states(folder, folder.read_manifest())
     counts = Counter(cell.state for cell in cells)
     left, bound = time_left(cells)

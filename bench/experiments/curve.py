@@ -20,7 +20,7 @@ from ..engine.config import ResolvedMethod, RunOptions, resolve_methods, with_me
 from ..engine.run import run
 from ..engine.store import Cell, RunFolder
 from ..errors import InputError
-from ..executors.options import ExecutionOptions
+from ..executors.settings import ExecutionOptions
 from ..io.files import check_kind, output_inside, refuse_links
 from ..io.lock import locked
 from ..options import DependentOptions

@@ -15,8 +15,7 @@ from ..engine.config import RunOptions, with_methods
 from ..engine.plan import trained
 from ..engine.run import run
 from ..engine.store import RunFolder
-from ..executors.options import ExecutionOptions
-from ..executors.settings import check_executor
+from ..executors.settings import ExecutionOptions, check_executor
 from ..io.files import check_kind, output_inside, write_json
 from ..io.lock import locked
 from ..registry import get, resolve

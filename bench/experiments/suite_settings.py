@@ -7,7 +7,7 @@ from typing import Literal
 
 from ..engine.config import parse_size
 from ..errors import InputError
-from ..executors.options import ExecutionOptions
+from ..executors.settings import ExecutionOptions
 from ..listing import presets_of_methods
 
 SEED = 39_000

@@ -16,7 +16,7 @@ from ..engine.plan import trained
 from ..engine.run import run
 from ..engine.store import RunFolder
 from ..errors import InputError
-from ..executors.options import ExecutionOptions
+from ..executors.settings import ExecutionOptions
 from ..io.files import check_kind, check_name, output_inside
 from ..io.lock import locked
 from ..registry import get, resolve

@@ -10,8 +10,7 @@ from ...bench.contracts import Progress
 from ...bench.engine.config import (
     parse_size,
 )
-from ...bench.executors.options import ExecutionOptions
-from ...bench.executors.settings import check_executor
+from ...bench.executors.settings import ExecutionOptions, check_executor
 from ...bench.io.files import (
     check_kind,
     check_output_folder,

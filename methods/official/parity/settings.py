@@ -8,7 +8,7 @@ from typing import Literal
 import tyro
 
 from ....bench.engine.config import parse_size
-from ....bench.executors.options import ExecutionOptions
+from ....bench.executors.settings import ExecutionOptions
 from ....bench.options import DependentOptions
 
 WITHOUT_PERCEPTUAL_LOSS = 15_000

@@ -17,7 +17,7 @@ from headbench.bench.audit.naming import Render, check_truth, composited
 from headbench.bench.contracts import FrameKey
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import HeadbenchError, InputError
-from headbench.bench.executors import remote
+from headbench.bench.executors.schedule import Schedule
 from headbench.bench.io.images import read_png, write_png
 from headbench.bench.rows import ALL, COLUMNS
 
@@ -59,7 +59,7 @@ def test_images_of_a_run_score_alike_in_every_layout(run, renders, images, tmp_p
 
 
 def test_a_failure_in_an_executor_names_its_reason_and_log(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(remote.Schedule, "run_all", lambda self, tasks: {"command": "It was killed."})
+    monkeypatch.setattr(Schedule, "run_all", lambda self, tasks: {"command": "It was killed."})
     with pytest.raises(HeadbenchError, match=r"It was killed\. Its log is .*job\.log"):
         evaluate_folder(options(tmp_path / "none", run, tmp_path / "out", executor="processes"))
 

@@ -13,11 +13,10 @@ from headbench.bench.engine import run as runner
 from headbench.bench.engine.run import _Run
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
-from headbench.bench.executors.outcome import read_outcome, write_outcome
 from headbench.bench.executors.schedule import Processes, Schedule
 from headbench.bench.executors.settings import Execution
 from headbench.bench.executors.status import CellState, time_left
-from headbench.bench.executors.task import Task
+from headbench.bench.executors.task import Task, read_outcome, update_record
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import is_locked
@@ -109,7 +108,8 @@ def test_kept_cells_are_named_and_changed_code_fails_others(config, rows_of, cap
     own = folder.read_manifest().machine
     for subject, processor in (("subject1", "A"), ("subject2", "B")):
         machine = {**own, "processor": processor}
-        write_outcome(cell_of(config, subject, "toy"), {"status": "done", "speed": False, "machine": machine})
+        outcome = {"status": "done", "speed": False, "machine": machine}
+        update_record(cell_of(config, subject, "toy"), task=outcome)
     runner.run(config, TWO)
     assert caplog.text.count("seed 0: kept: trained ") == 2
     assert folder.read_manifest().machine == {**own, "processor": "A and B"}
