@@ -27,10 +27,13 @@ class SlurmSettings:
     partition: str | None = None
     """Partition; None for the cluster's default."""
     gpus: int = 0
+    """GPUs of each job."""
     cpus: int = 4
     """Processors of each job, also its number of threads."""
     memory_gb: float = 8.0
+    """Memory of each job, GB."""
     hours: float = 4.0
+    """Time limit of each job."""
     parallel: int = 64
     """Maximum number of concurrent jobs of an array."""
     exclusive: bool = True
