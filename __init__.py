@@ -13,9 +13,8 @@ from typing import Any as _Any
 if _TYPE_CHECKING:
     from .bench.api import evaluate, list_methods, open_clip, run, train
     from .bench.condition import PLAIN, Condition, Named
-    from .bench.conformance.methods import check_method
-    from .bench.conformance.metrics import check_metric
-    from .bench.conformance.readers import check_clip, check_reader
+    from .bench.conformance.command import check_clip, check_reader
+    from .bench.conformance.methods import check_method, check_metric
     from .bench.contracts import (
         STAGES,
         Avatar,
@@ -160,9 +159,8 @@ _HOMES = {
     "bench.api": ("evaluate", "list_methods", "open_clip", "run", "train"),
     "bench.engine.adaptation": ("AdaptedClip", "MethodNeeds"),
     "bench.condition": ("PLAIN", "Condition", "Named"),
-    "bench.conformance.methods": ("check_method",),
-    "bench.conformance.metrics": ("check_metric",),
-    "bench.conformance.readers": ("check_clip", "check_reader"),
+    "bench.conformance.methods": ("check_method", "check_metric"),
+    "bench.conformance.command": ("check_clip", "check_reader"),
     "bench.options": ("DependentOptions",),
     "bench.errors": ("HeadbenchError", "InputError", "LeftOutError", "UnavailableError"),
     "bench.engine.config": ("resolve_method",),

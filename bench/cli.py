@@ -12,8 +12,7 @@ from importlib.metadata import version
 
 from .errors import ExitCode, HeadbenchError, Interruption
 from .machine import limit_threads
-from .streams import prepare_streams, show
-from .terminal import wrapped
+from .terminal import prepare_streams, show, wrapped
 
 
 def main(arguments: list[str] | None = None) -> int:

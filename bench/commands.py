@@ -11,8 +11,7 @@ from collections.abc import Mapping, Sequence
 from .errors import EXIT_CODES, ExitCode, InputError
 from .registry import Plugin, discover
 from .specs import COMMAND_GROUPS, HELP
-from .streams import show
-from .terminal import wrapped
+from .terminal import show, wrapped
 
 _ALIASES = {
     "compare": "analyze",

@@ -41,9 +41,9 @@ from .io.files import (
 from .io.lock import locked
 from .listing import presets_of_methods
 from .machine import check_device, processor_count
-from .named_protocol import check_capture, needed
 from .progress import counted, log_to_file
 from .progress import progress as show_progress
+from .protocol import check_capture, needed
 from .registry import get, resolve
 from .specs import CommandResult, command
 

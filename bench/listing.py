@@ -9,7 +9,7 @@ from typing import Any, Literal
 import tyro
 
 from .contracts import Progress
-from .named_protocol import named_protocols
+from .protocol import named_protocols
 from .registry import Group, discover, get, resolve
 from .specs import CommandResult, command
 

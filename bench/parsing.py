@@ -23,8 +23,7 @@ from .process import environment_variable
 from .progress import log_to_terminal, progress
 from .registry import Plugin, discover, get, resolve
 from .specs import HELP, CommandSpec
-from .streams import show
-from .terminal import wrapped
+from .terminal import show, wrapped
 
 Command = Callable[..., Callable[[], int]]
 """Takes settings and returns a function that runs the command, which separates parsing errors from errors of the command."""

@@ -305,7 +305,7 @@ def counts() -> dict[str, dict[str, int]]:
 
 
 if __name__ == "__main__":  # for `make check`
-    from ..bench.named_protocol import named_protocols
+    from ..bench.protocol import named_protocols
 
     print(f"{len(papers())} papers, {len(named_protocols())} protocols")
     for grade, numbers in counts().items():

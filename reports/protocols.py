@@ -12,8 +12,7 @@ from ..bench.contracts import FrameKey, Progress
 from ..bench.engine.config import CANONICAL
 from ..bench.errors import InputError
 from ..bench.io.files import check_writable, write_text
-from ..bench.named_protocol import NamedProtocol, TaskFrames, named_protocols
-from ..bench.protocol import TASK_TITLES
+from ..bench.protocol import TASK_TITLES, NamedProtocol, TaskFrames, named_protocols
 from ..bench.registry import get
 from ..bench.rows import FULL
 from ..bench.specs import CommandResult, MetricSpec, command

@@ -175,7 +175,7 @@ def tables_of(
         raise InputError("command line", "--protocol", expected, part.text)
     runs = RunSet.read(run_folders, part)
     if protocol is not None:
-        from ..bench.named_protocol import protocol_named
+        from ..bench.protocol import protocol_named
         from .protocols import under
 
         runs = under(runs, protocol, protocol_named(protocol))

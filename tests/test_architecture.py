@@ -179,7 +179,6 @@ def test_no_code_contains(what):
 READ_IN_ONE_PLACE = {
     r"\bnp\.load\(|\bzipfile\.ZipFile\(": {
         "bench/io/arrays.py",
-        "bench/io/unpickle.py",
         "datasets/nersemble/benchmark/submission.py",
         "methods/avatars/formats.py",  # an archive just made in memory
     },
@@ -189,13 +188,12 @@ READ_IN_ONE_PLACE = {
         "methods/official/gha/stages.py",  # a program for the authors' interpreter, run there
     },
     r"\bImage\.open\(|\bimageio\b|\bimread\(|\bimsave\(|skimage\.io\b|mimread|\.fromarray\(.*\.save\(": {
-        "bench/io/images.py",  # the words, in the names of OpenCV's functions
-        "bench/io/video.py",  # the package that brings ffmpeg
+        "bench/io/images.py",  # the words, in the names of OpenCV's functions; the package that brings ffmpeg
         "methods/official/gha/method.py",  # names of packages that the authors' code needs
         "methods/official/shim/unused.py",
     },
     r"\bcv2\.VideoCapture\(": {
-        "bench/io/video.py",
+        "bench/io/images.py",
         "datasets/nersemble/sequence.py",
         "datasets/video/decode.py",
     },

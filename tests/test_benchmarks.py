@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from headbench.bench.benchmarks import findings, table, take_turns
 from headbench.bench.contracts import no_progress
+from headbench.bench.doctor import findings, table, take_turns
 from headbench.bench.registry import discover
 from headbench.methods.benchmarks import avatar, splats, training
 from headbench.methods.benchmarks.scenes import cloud

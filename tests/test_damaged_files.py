@@ -21,10 +21,9 @@ from hypothesis import strategies as st
 from headbench.bench.configuration import build_file
 from headbench.bench.engine.config import RunConfig
 from headbench.bench.errors import InputError
-from headbench.bench.io.arrays import read_npy, read_npz
+from headbench.bench.io.arrays import read_npy, read_npz, read_pickle, read_saved
 from headbench.bench.io.documents import read_json, read_yaml
 from headbench.bench.io.images import read_pixels
-from headbench.bench.io.unpickle import read_pickle, read_saved
 from headbench.bench.rows import Row, Rows
 from headbench.datasets.colmap.model import read_model
 from headbench.datasets.colmap.reader import model_cameras

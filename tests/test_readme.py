@@ -41,7 +41,7 @@ def test_every_command_is_listed(capsys):
 
 
 def test_the_readme_counts_what_is_stored():
-    from headbench.bench.named_protocol import named_protocols
+    from headbench.bench.protocol import named_protocols
     from headbench.reports.papers import papers
 
     said = f"Tables of {len(papers())} papers and {len(named_protocols())} evaluation protocols"

@@ -44,13 +44,12 @@ from ..io.files import (
     digest_file,
 )
 from ..io.images import probe_image, read_pixels, read_png, write_png
-from ..named_protocol import check_capture, needed
 from ..options import DependentOptions
-from ..protocol import Protocol, make_protocols
+from ..protocol import Protocol, check_capture, make_protocols, needed
 from ..registry import discover, get, resolve
 from ..rows import Rows
 from ..specs import CommandResult, MethodSpec, MetricSpec, command
-from .naming import Render, check_truth, composited, named_renders
+from .frames import Render, check_truth, composited, named_renders
 
 
 @dataclass(frozen=True)

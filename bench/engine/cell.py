@@ -36,9 +36,8 @@ from ..rows import FULL, SUSPECT, Row, Rows
 from ..specs import DYNAMIC, MetricSpec
 from .adaptation import AdaptedClip
 from .config import resolve_change
-from .guard import TrainingView, check_frame
 from .plan import MEASURING_AVATAR, RENDERING, TRAINING, Job, source_fingerprint, trained_ago, trained_record
-from .scoring import Score, ScoredFrames, make_metric, score_frames
+from .scoring import Score, ScoredFrames, TrainingView, check_frame, make_metric, score_frames
 from .stored import shown_by, training_losses, write_avatar_record
 
 log = logging.getLogger(__name__)

@@ -36,8 +36,7 @@ from . import adaptation
 from .adaptation import AdaptedClip, MethodNeeds
 from .captures import PROGRAMS, changed, check_trusted, open_clips, open_run_clips, run_configuration
 from .config import ResolvedMethod, RunConfig, RunOptions, resolve_cells, resolve_metrics
-from .guard import TrainingView
-from .scoring import check_regions
+from .scoring import TrainingView, check_regions
 from .store import Cell, CellRecord, RunFolder
 from .stored import AVATAR_FILE
 

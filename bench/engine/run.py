@@ -26,9 +26,8 @@ from ..executors.settings import Execution, check_executor
 from ..executors.task import FULL_DISK, Task, read_outcome
 from ..io.files import check_kind, check_output_folder
 from ..io.lock import locked
-from ..live import Position
 from ..machine import check_device, check_device_answers, peak_memory_bytes
-from ..progress import RunProgress, counted, duration, run_progress
+from ..progress import Position, RunProgress, counted, duration, run_progress
 from ..protocol import TASK_TITLES, Protocol, missing_tasks
 from ..registry import discover, get, resolve
 from ..rows import Rows

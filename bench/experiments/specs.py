@@ -36,14 +36,14 @@ TRACKING_ERROR = ConditionSpec(
     name="tracking-error",
     summary="Clip: another level of tracking error, of synthetic captures; parameter level.",
     kind="clip",
-    implementation="headbench.bench.experiments.tracking:with_tracking_error",
+    implementation="headbench.bench.experiments.held_out:with_tracking_error",
 )
 
 VARIANT = ConditionSpec(
     name="variant",
     summary="Derive: a smaller or faster avatar without training; parameter name, see `run sweep`.",
     kind="derive",
-    implementation="headbench.bench.experiments.sweep:variant",
+    implementation="headbench.bench.experiments.curve:variant",
 )
 
 TEST_REFIT = ConditionSpec(
@@ -72,7 +72,7 @@ AGAINST_TRUTH = (
     MetricSpec("response", "Response", "ratio", True, 2, "", kind="avatar"),
     MetricSpec("flicker", "Flicker", "levels", False, 3, "", kind="avatar"),
 )
-"""Metrics of `truth.TruthJudge` and `surface.surface`, with limits derived from the ground truth."""
+"""Metrics of `truth.TruthJudge` and `stability.surface`, with limits derived from the ground truth."""
 
 EXTREMES = ConditionSpec(
     name="extremes",

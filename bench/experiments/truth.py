@@ -25,8 +25,7 @@ from ..io.images import quantise, read_png, write_png
 from ..io.provenance import SYNTHETIC
 from ..registry import get, resolve
 from ..rows import FULL
-from .stability import LimitCheck
-from .surface import FACE, NO_FACE, absent_surface
+from .stability import FACE, NO_FACE, LimitCheck, absent_surface
 
 FOLDER = "truth"
 POSE_FIELDS = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids")

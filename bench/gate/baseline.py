@@ -17,9 +17,9 @@ from ..io.documents import checked, read_json, shown
 from ..io.files import check_name, write_json
 from ..rows import ALL, FRAME, FULL
 from ..specs import MAX_DIGITS, MetricSpec
-from .settings import Captures
 
 AVATAR = "avatar"
+Captures = Literal["same", "remade"]
 
 
 class ResultKey(NamedTuple):

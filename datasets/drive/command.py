@@ -29,10 +29,9 @@ from ...bench.experiments.extremes import training_poses
 from ...bench.experiments.reenactment import AT_ORIGIN, RigidMean, retarget, view_camera
 from ...bench.io.arrays import MAX_MAGNITUDE, Member, read_arrays
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_json
-from ...bench.io.images import quantise, write_png
+from ...bench.io.images import ENCODINGS, browser_encoder, quantise, write_browser_video, write_png
 from ...bench.io.lock import locked
 from ...bench.io.provenance import RENDER
-from ...bench.io.video import ENCODINGS, browser_encoder, write_browser_video
 from ...bench.specs import CommandResult, command
 from ..clip import CaptureClip, FrameFiles, without_images
 from ..ga.writer import CANONICAL_JAW, CapturePlan, CaptureWriter, SequencePlan

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.benchmarks import Row, table
 from ...bench.contracts import Progress
+from ...bench.doctor import Row, table
 from ...bench.specs import CommandResult
 from .arrays import HeadArrays
 from .model import HeadModel

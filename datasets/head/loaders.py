@@ -28,10 +28,9 @@ import numpy as np
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
-from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy
+from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy, read_pickle
 from ...bench.io.documents import read_json, read_text
 from ...bench.io.files import open_regular, reading
-from ...bench.io.unpickle import read_pickle
 from .arrays import RING_REGIONS, HeadArrays, read_head, with_derived_regions
 from .ict import ict_head, is_ict, read_ict
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
-from ...bench.io.arrays import Member, check_arrays
+from ...bench.io.arrays import Member, check_arrays, read_saved
 from ...bench.io.files import entries
-from ...bench.io.unpickle import read_saved
 from ..monocular.track import frame_number
 
 FOLDER, SUFFIX = "checkpoint", ".frame"

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.io.files import write_json
+from ...bench.landmark_network import LICENCE, WHEEL, fetch_networks
 from ...bench.manifest import cut_of
 from ...bench.progress import counted
 from ...bench.protocol import evenly_with_ends
 from ...bench.specs import CommandResult, command
-from ...bench.tflite import LICENCE, WHEEL, fetch_networks
 from .settings import TrackSettings
 from .work import WORK, check_work_folder, make_work_folder
 

@@ -24,8 +24,8 @@ from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.files import digest, digest_file
 from ...bench.io.images import probe_image
+from ...bench.landmark_network import fetched_network, open_network
 from ...bench.protocol import evenly_with_ends
-from ...bench.tflite import fetched_network, open_network
 from ..clip import CaptureClip
 from ..ga.content_digests import content_digests
 from ..head.arrays import HeadArrays

@@ -13,9 +13,8 @@ from ...bench.contracts import HeadAsset, Progress
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member, cached_arrays
 from ...bench.io.files import digest
-from ...bench.landmark_network import COUNT
+from ...bench.landmark_network import COUNT, fetched_network
 from ...bench.progress import counted
-from ...bench.tflite import fetched_network
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
 from ..tracking.embedding import Embedding

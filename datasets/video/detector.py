@@ -18,8 +18,16 @@ import numpy as np
 from ...bench.contracts import ByteArray, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.files import digest, digest_file
-from ...bench.landmark_network import CROP, FaceCrop, LandmarkNetwork, face_distance, face_size
-from ...bench.tflite import NETWORKS, fetched_network, open_network
+from ...bench.landmark_network import (
+    CROP,
+    NETWORKS,
+    FaceCrop,
+    LandmarkNetwork,
+    face_distance,
+    face_size,
+    fetched_network,
+    open_network,
+)
 
 SIDE, STRIDE = 192, 4
 """Pixels of the square that the network sees, and of one cell of its grid."""

@@ -19,7 +19,7 @@ import readme_pictures
 
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
-from headbench.bench.experiments.robustness import RECORD_FILE
+from headbench.bench.experiments.extremes import RECORD_FILE
 from headbench.bench.io.files import write_json, write_text
 from headbench.bench.progress import counted
 from headbench.bench.protocol import TASK_TITLES, UNSEEN_CAMERAS

@@ -10,8 +10,8 @@ from statistics import median
 
 import torch
 
-from ...bench.benchmarks import Row, findings, take_turns
 from ...bench.contracts import Progress, StagedAvatar
+from ...bench.doctor import Row, findings, take_turns
 from ...bench.specs import CommandResult
 from ..shared.threads import torch_threads
 from .untrained import MemoryClip, beside_ga, untrained

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...bench.benchmarks import Row, table
 from ...bench.contracts import Progress
+from ...bench.doctor import Row, table
 from ...bench.specs import CommandResult
 from ..splats.constants import ALPHA_MIN
 from ..splats.rasterize import available_backends, rasterize

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...bench.benchmarks import Row, findings, take_turns
 from ...bench.contracts import Progress
+from ...bench.doctor import Row, findings, take_turns
 from ...bench.specs import CommandResult
 from ..shared.threads import torch_threads
 from ..splats import available_backends, cpu, rasterize

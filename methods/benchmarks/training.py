@@ -14,9 +14,9 @@ from typing import Any
 import torch
 from torch.profiler import ProfilerActivity, profile
 
-from ...bench.benchmarks import Row, findings, take_turns
 from ...bench.configuration import build
 from ...bench.contracts import Progress
+from ...bench.doctor import Row, findings, take_turns
 from ...bench.specs import CommandResult, MethodSpec
 from ...datasets.head.procedural.model import procedural_head
 from ..ga.config import GAConfig

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ...bench.native.loader import Kernel
+from ...bench.native.dispatch import Kernel
 
 KERNEL = Kernel(
     "headbench.methods.insta._kernel", "INSTA's kernel", "the reference works meanwhile, very slowly"

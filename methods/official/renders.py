@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from ...bench.audit.naming import MAP_REMEDY, Listing, Render, Renders, every_frame
+from ...bench.audit.frames import MAP_REMEDY, Listing, Render, Renders, every_frame
 from ...bench.contracts import Clip, FrameKey
 from ...bench.errors import InputError
 

@@ -80,7 +80,7 @@ def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) ->
 
     Every image in the program's folders must be exported for a training key, each equally often, or be a placeholder of a
     single pixel, which shows no frame. `clip` gives no pixels of other frames
-    (`headbench.bench.engine.guard.TrainingView`), so that none can have such a name.
+    (`headbench.bench.engine.scoring.TrainingView`), so that none can have such a name.
     """
     allowed = frozenset(clip.splits["train"])
     for path, key in images.items():

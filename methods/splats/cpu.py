@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ...bench.native.dispatch import is_float32, on_host
-from ...bench.native.loader import Kernel
+from ...bench.native.dispatch import Kernel, is_float32, on_host
 from ..shared.threads import threads as kernel_threads
 from .request import Rendering, Request
 

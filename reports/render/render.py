@@ -18,9 +18,8 @@ from ...bench.engine.stored import open_avatar
 from ...bench.errors import InputError
 from ...bench.experiments.extremes import head_center
 from ...bench.experiments.viewpoints import turntable
-from ...bench.io.images import quantise, read_png, write_png
+from ...bench.io.images import browser_encoder, quantise, read_png, write_browser_video, write_png
 from ...bench.io.provenance import COMPOSITE, RENDER
-from ...bench.io.video import browser_encoder, write_browser_video
 from ...bench.progress import counted
 from ...bench.specs import CommandResult, command
 from .settings import RenderSettings

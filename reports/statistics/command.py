@@ -13,7 +13,7 @@ import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.gate.settings import DEPENDENT, BaselineOptions
+from ...bench.gate.command import DEPENDENT, BaselineOptions
 from ...bench.options import DependentOptions
 from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES

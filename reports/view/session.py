@@ -17,9 +17,8 @@ import numpy as np
 from ...bench.contracts import ByteArray, Camera, FloatArray
 from ...bench.errors import HeadbenchError
 from ...bench.experiments.viewpoints import turntable
-from ...bench.io.images import write_png
+from ...bench.io.images import write_browser_video, write_png
 from ...bench.io.provenance import COMPOSITE
-from ...bench.io.video import write_browser_video
 from ...bench.registry import resolve
 from .drawing import draw, rotations, splats_of
 from .panel import ControlPanel

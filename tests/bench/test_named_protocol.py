@@ -8,7 +8,7 @@ import yaml
 from headbench.bench.configuration import build_file
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
-from headbench.bench.named_protocol import FOLDER, NamedProtocol, check_capture, named_protocols, needed
+from headbench.bench.protocol import FOLDER, NamedProtocol, check_capture, named_protocols, needed
 from headbench.bench.registry import discover
 
 

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from headbench.bench.benchmarks import table
+from headbench.bench.doctor import table
 from headbench.bench.errors import HeadbenchError
 from headbench.bench.io.documents import checked, read_json
 from headbench.bench.io.files import write_json

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from headbench.bench.benchmarks import take_turns
 from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget, no_progress
+from headbench.bench.doctor import take_turns
 from headbench.bench.machine import use_device
 from headbench.bench.registry import discover, resolve
 from headbench.bench.specs import MethodSpec

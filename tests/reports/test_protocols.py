@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.bench.named_protocol import NamedProtocol, TaskFrames, named_protocols
+from headbench.bench.protocol import NamedProtocol, TaskFrames, named_protocols
 from headbench.bench.rows import Rows
 from headbench.reports.aggregate import summarise
 from headbench.reports.protocols import USUAL, ProtocolsSettings, choices, protocols_command, under

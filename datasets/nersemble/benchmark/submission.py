@@ -19,8 +19,7 @@ import numpy as np
 from ....bench.contracts import ByteArray, Progress
 from ....bench.errors import InputError
 from ....bench.io.files import atomic_path, check_writable, reading
-from ....bench.io.images import probe_image, read_png
-from ....bench.io.video import encode_h264, ffmpeg
+from ....bench.io.images import encode_h264, ffmpeg, probe_image, read_png
 from ..sequence import open_video, probe_video
 from .tracks import CRF, TRACKS, BenchmarkTrack, Video
 

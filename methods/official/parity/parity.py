@@ -13,10 +13,10 @@ from typing import Any
 
 from scipy.stats import t as student_t
 
-from ....bench.benchmarks import table as aligned
 from ....bench.condition import Condition, Named, label_of
 from ....bench.configuration import build
 from ....bench.contracts import Progress, no_progress
+from ....bench.doctor import table as aligned
 from ....bench.engine.config import RunConfig, parse_size, resolve_cells
 from ....bench.engine.plan import check_settings
 from ....bench.engine.run import run

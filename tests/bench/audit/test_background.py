@@ -6,7 +6,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.audit.evaluate import check_background
-from headbench.bench.audit.naming import Render
+from headbench.bench.audit.frames import Render
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import write_png
 

@@ -13,7 +13,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.audit.evaluate import EvaluateSettings, evaluate_folder
-from headbench.bench.audit.naming import Render, check_truth, composited
+from headbench.bench.audit.frames import Render, check_truth, composited
 from headbench.bench.contracts import FrameKey
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import HeadbenchError, InputError

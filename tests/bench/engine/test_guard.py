@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Frame, FrameKey
-from headbench.bench.engine.guard import TrainingView, check_frame
+from headbench.bench.engine.scoring import TrainingView, check_frame
 from headbench.bench.errors import HeadbenchError, InputError
 
 

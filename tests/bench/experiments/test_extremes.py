@@ -13,13 +13,15 @@ from sklearn.decomposition import PCA
 from headbench.bench.contracts import FrameKey, HeadPose
 from headbench.bench.errors import InputError
 from headbench.bench.experiments.extremes import (
+    RECORD_FILE,
     ExtremesPlan,
+    ExtremesSettings,
     PoseComponents,
+    extremes_run,
     joint_samples,
     path_poses,
     sampled_poses,
 )
-from headbench.bench.experiments.robustness import RECORD_FILE, ExtremesSettings, extremes_run
 from headbench.bench.experiments.specs import AGAINST_TRUTH
 from headbench.bench.experiments.specs import MEASURES as STABILITY
 from headbench.bench.io.images import read_png

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from headbench.bench.contracts import Camera, Frame, FrameKey, HeadPose
-from headbench.bench.experiments.identity import (
+from headbench.bench.experiments.reenactment import (
     NO_APPEARANCE,
     RecordedAppearance,
     RigidVertices,

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import HeadPose
 from headbench.bench.errors import InputError
+from headbench.bench.experiments.extremes import RECORD_FILE, ReenactSettings, reenact_run
 from headbench.bench.experiments.reenactment import RigidMean, retarget
-from headbench.bench.experiments.robustness import RECORD_FILE, ReenactSettings, reenact_run
 from headbench.bench.io.images import read_png
 from headbench.reports.robustness.sheets import SHEET_FILE
 

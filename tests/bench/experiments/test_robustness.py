@@ -5,7 +5,7 @@ import json
 import pandas as pd
 import pytest
 
-from headbench.bench.experiments.robustness import (
+from headbench.bench.experiments.extremes import (
     ExtremesSettings,
     ReenactSettings,
     extremes_run,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Camera, TrueFrame
-from headbench.bench.experiments.surface import NO_DEPTH, NO_FACE, NOT_SHOWN, normals, surface
+from headbench.bench.experiments.stability import NO_DEPTH, NO_FACE, NOT_SHOWN, normals, surface
 
 CAMERA = Camera("c", 64, 48, np.array([[80.0, 0, 32], [0, 80, 24], [0, 0, 1]]), np.eye(4))
 RAYS = np.stack([*np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5), np.ones((48, 64))], axis=2)

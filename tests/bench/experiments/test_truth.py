@@ -13,7 +13,7 @@ from headbench.bench.engine.config import RunConfig, resolve_cells
 from headbench.bench.engine.plan import make_jobs
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.experiments import extremes
-from headbench.bench.experiments.robustness import ExtremesSettings
+from headbench.bench.experiments.extremes import ExtremesSettings
 from headbench.bench.experiments.truth import TRUTH_LIMITS, TruthJudge, TruthPair, TruthPictures
 from headbench.datasets.open import open_clip
 from headbench.datasets.synthetic.capture import synthesize

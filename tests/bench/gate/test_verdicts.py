@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from headbench.bench.gate.baseline import Baseline, ResultKey, Results, Tolerance
-from headbench.bench.gate.verdicts import (
+from headbench.bench.gate.command import (
     Verdict,
     environment_changes,
     exit_code,

@@ -9,9 +9,8 @@ import pytest
 from PIL import Image
 
 from headbench.bench.errors import InputError
-from headbench.bench.io.images import read_png, write_png
+from headbench.bench.io.images import read_png, write_browser_video, write_png
 from headbench.bench.io.provenance import COMPOSITE, RENDER, SYNTHETIC, note
-from headbench.bench.io.video import write_browser_video
 from headbench.methods.avatars.formats import STANDARD
 from headbench.methods.shared.ply import read_ply, write_ply
 

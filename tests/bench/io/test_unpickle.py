@@ -11,7 +11,7 @@ import scipy.sparse
 import torch
 
 from headbench.bench.errors import InputError
-from headbench.bench.io.unpickle import read_pickle, read_saved
+from headbench.bench.io.arrays import read_pickle, read_saved
 
 from ...datasets.head.flame_files import chumpy_stand_in, flame_content, legacy_pickle
 from ...datasets.head.toy import toy_head

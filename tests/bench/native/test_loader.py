@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from headbench.bench.errors import UnavailableError
-from headbench.bench.native.loader import Kernel
+from headbench.bench.native.dispatch import Kernel
 
 
 def test_an_installed_kernel_is_loaded_with_instruction_sets(monkeypatch):

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from headbench.bench.conformance.readers import check_clip
+from headbench.bench.conformance.command import check_clip
 from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.colmap.command import ExportColmapSettings, export_colmap

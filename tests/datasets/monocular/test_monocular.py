@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.bench.conformance.readers import check_clip
+from headbench.bench.conformance.command import check_clip
 from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.bench.protocol import make_protocols

@@ -6,7 +6,7 @@ import pytest
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError, UnavailableError
-from headbench.bench.native.loader import Kernel
+from headbench.bench.native.dispatch import Kernel
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.datasets.synthetic.panels import (
     KERNEL,

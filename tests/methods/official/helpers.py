@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.bench.engine.guard import TrainingView
+from headbench.bench.engine.scoring import TrainingView
 from headbench.bench.io.arrays import check_arrays
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.tracker_files.metrical import MEMBERS, metrical_frame

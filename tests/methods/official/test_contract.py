@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Budget, FrameKey, ListedFrames, SharingAvatar
-from headbench.bench.engine.guard import TrainingView
+from headbench.bench.engine.scoring import TrainingView
 from headbench.bench.engine.stored import avatar_digest
 from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from headbench.bench.errors import UnavailableError
-from headbench.bench.native.loader import Kernel
+from headbench.bench.native.dispatch import Kernel
 from headbench.methods.benchmarks.scenes import (
     SplatScene,
     cloud,
