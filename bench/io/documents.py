@@ -206,7 +206,9 @@ def _for_settings(schema: Any) -> Any:
             choices = [(each, _CHOICE) for each in schema["choices"]]
             return {**schema, "choices": choices, "mode": "left_to_right"}
         case "str":
-            return {**schema, "coerce_numbers_to_str": True}
+            return {"coerce_numbers_to_str": True, **schema}
+        case "dict" if schema["values_schema"]["type"] == "str":  # such as printed numbers
+            schema["values_schema"]["coerce_numbers_to_str"] = False
         case "bool":
             return {**schema, "strict": True}
         case "float":

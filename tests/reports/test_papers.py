@@ -163,7 +163,7 @@ CHANGES = [
     (lambda p: p["tables"][0]["rows"][0]["values"].update(psnr="3"), "values: TASK/METRIC of .*; found psnr"),
     (
         lambda p: p["tables"][0]["rows"][0]["values"].update(fps=25),
-        "values, fps: a number as printed, in quotes; found 25",
+        "values.fps: expected text, found 25",
     ),
     (lambda p: p["tables"][0]["rows"][0]["values"].update({"drive/psnr": "3"}), "found drive/psnr"),
 ]
