@@ -237,7 +237,7 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
 
 
 def _configuration_of(run: Path, values: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
-    """Configuration of a run whose avatars are used. Raises `InputError` for code that it names and the ``values`` do not."""
+    """Configuration of a run whose avatars are used."""
     from .engine.captures import PROGRAMS, check_trusted, programs, run_configuration
 
     used: Any = tuple(group for group in ("methods", "metrics") if group not in values)

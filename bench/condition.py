@@ -43,18 +43,12 @@ def seconds_of_text(text: str) -> float | None:
 
 @dataclass(frozen=True)
 class Named:
-    """A registered change and its parameters.
-
-    Attributes
-    ----------
-    name : str
-        Name of a `ConditionSpec`; "" for no change.
-    parameters : dict
-        Keyword arguments of its implementation, as JSON values.
-    """
+    """A registered change and its parameters."""
 
     name: str = ""
+    """Name of a `ConditionSpec`; "" for no change."""
     parameters: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of its implementation, as JSON values."""
 
     def __bool__(self) -> bool:
         return bool(self.name)
@@ -62,41 +56,28 @@ class Named:
 
 @dataclass(frozen=True)
 class Condition:
-    """A named set of changes. The plain comparison has no changes and the name "".
-
-    Attributes
-    ----------
-    name : str
-        Name after the method in tables, and part of the cell's folder name.
-    methods : tuple of str
-        Names of the methods that it applies to; empty: all.
-    settings : dict
-        Changes of the method's settings, applied over those of the run.
-    budget : str
-        Fraction of the method's budget in (0, 1], such as "1/4"; or a training time instead, such as "30 s".
-    as_tracked : bool
-        Train on the head model, neck, static offset and cameras of the capture, without the usual conversion to another head
-        model and a single video (`MethodSpec.conversion`).
-    clip : Named
-        Change of the clip that the method is trained on; the scored frames do not change.
-    derive : Named
-        Change of a trained avatar without training, such as fewer splats. The avatar is that of the run's ``source`` or,
-        without one, that of the plain comparison in the same run.
-    drive : Named
-        Poses and views to render instead of the scored frames, evaluated without ground truth.
-    views : Named
-        Change of the camera and pose that each scored frame is rendered with by the avatar, which is that of ``derive``.
-    """
+    """A named set of changes. The plain comparison has no changes and the name ""."""
 
     name: str = ""
+    """Name after the method in tables, and part of the cell's folder name."""
     methods: tuple[str, ...] = ()
+    """Names of the methods that it applies to; empty: all."""
     settings: dict[str, Any] = field(default_factory=dict)
+    """Changes of the method's settings, applied over those of the run."""
     budget: str = "1"
+    """Fraction of the method's budget in (0, 1], such as "1/4"; or a training time instead, such as "30 s"."""
     as_tracked: bool = False
+    """Train on the head model, neck, static offset and cameras of the capture, without the usual conversion to
+    another head model and a single video (`MethodSpec.conversion`)."""
     clip: Named = field(default_factory=Named)
+    """Change of the clip that the method is trained on; the scored frames do not change."""
     derive: Named = field(default_factory=Named)
+    """Change of a trained avatar without training, such as fewer splats. The avatar is that of the run's ``source``
+    or, without one, that of the plain comparison in the same run."""
     drive: Named = field(default_factory=Named)
+    """Poses and views to render instead of the scored frames, evaluated without ground truth."""
     views: Named = field(default_factory=Named)
+    """Change of the camera and pose that each scored frame is rendered with by the avatar, which is that of ``derive``."""
 
     def __post_init__(self) -> None:
         """Refuse a budget that is neither a fraction nor a time."""

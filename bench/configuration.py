@@ -71,12 +71,12 @@ def build(cls: type[T], values: Mapping[str, Any], source: str, prefix: str = ""
 
 
 def build_folder(cls: type[T], folder: Path) -> dict[str, T]:
-    """Build ``cls`` from every YAML file of a folder, by file name. Raises `InputError` as `build` does."""
+    """Build ``cls`` from every YAML file of a folder, by file name."""
     return {path.stem: build_file(cls, path) for path in sorted(folder.glob("*.yaml"))}
 
 
 def build_named(cls: type[T], folder: Path, name: str, option: str) -> T:
-    """Build ``cls`` from the YAML file of a name. Raises `InputError` for an unknown one, naming the option, and as `build` does."""
+    """Build ``cls`` from the YAML file of a name."""
     names = [path.stem for path in folder.glob("*.yaml")]
     if name not in names:
         raise unknown("command line", option, name, names)
@@ -84,7 +84,7 @@ def build_named(cls: type[T], folder: Path, name: str, option: str) -> T:
 
 
 def build_file(cls: type[T], path: Path) -> T:
-    """Build ``cls`` from a YAML file. Raises `InputError` as `build` does."""
+    """Build ``cls`` from a YAML file."""
     return build(cls, read_yaml(path), str(path))
 
 

@@ -47,25 +47,17 @@ class FrameKey(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera without distortion.
-
-    Attributes
-    ----------
-    id : str
-        Name within the clip, used by keys.
-    width, height : int
-        Image size, pixels.
-    K : FloatArray
-        (3, 3) float64, pixels. Every renderer uses the principal point.
-    world_to_camera : FloatArray
-        (4, 4) float64 rigid motion, metres, OpenCV axes.
-    """
+    """A pinhole camera without distortion."""
 
     id: str
+    """Name within the clip, used by keys."""
     width: int
     height: int
+    """``width``, ``height``: Image size, pixels."""
     K: FloatArray
+    """(3, 3) float64, pixels. Every renderer uses the principal point."""
     world_to_camera: FloatArray
+    """(4, 4) float64 rigid motion, metres, OpenCV axes."""
 
     @property
     def center(self) -> FloatArray:
@@ -219,17 +211,12 @@ class Budget:
 
     Schedules are fractions of the budget, so that a short run follows the course of a long one. With only a
     limit in seconds, the method estimates its iterations, again during the training, and reports the estimate.
-
-    Attributes
-    ----------
-    iterations : int | None
-        Number of iterations of the training; None for no limit.
-    seconds : float | None
-        Time of the training; None for no limit.
     """
 
     iterations: int | None = None
+    """Number of iterations of the training; None for no limit."""
     seconds: float | None = None
+    """Time of the training; None for no limit."""
 
 
 class Frame(NamedTuple):

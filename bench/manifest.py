@@ -107,7 +107,7 @@ class ProtocolRecord:
         return cls(protocol.id, protocol.hash, **own)
 
     def protocol(self, source: Path) -> Protocol:
-        """The protocol recorded in the file ``source``. Raises `InputError` if its hash differs from the recorded one."""
+        """The protocol recorded in the file ``source``."""
         protocol = Protocol(**{f.name: getattr(self, f.name) for f in fields(Protocol)})
         if protocol.hash != self.hash:
             raise InputError(source, f"protocols.{self.task}", self.hash, protocol.hash)
@@ -131,7 +131,7 @@ def protocol_path(folder: Path, protocol: str) -> Path:
 
 
 def _read_protocol(run: Path, task: str, name: str) -> ProtocolRecord:
-    """Read the protocol with the hash ``name``. Raises `InputError` if it is not in the run folder."""
+    """Read the protocol with the hash ``name``."""
     path = protocol_path(run.parent, name)
     if not path.exists():
         expected = f"the protocol of {task} that {run.name} names"
@@ -198,42 +198,33 @@ def _text(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything that determined the values of a run.
-
-    Attributes
-    ----------
-    metrics, methods, protocols : tuple[MetricSpec, ...], tuple[MethodRecord, ...], dict[str, ProtocolRecord]
-        In the order of the configuration; protocols by task, in files of their own.
-    machine : dict[str, Any]
-        Processor, cores, memory in bytes, system, package versions and accelerators; for a run on a
-        CUDA device, also the device, CUDA's version and whether TF32 was enabled. See `machine_record`.
-    seconds, peak_memory_bytes : float | None, int | None
-        Of the last start of the run; None until it has ended.
-    adapted : tuple[AdaptedRecord, ...]
-        Clips that were adapted to a method.
-    capture_seconds : float | None
-        Time that the demo took to make its capture.
-    unchecked : bool | None
-        True if the captures were not searched for errors that change results: `headbench run --unchecked`.
-    """
+    """Everything that determined the values of a run."""
 
     configuration: RunConfig
     methods: tuple[MethodRecord, ...]
     metrics: tuple[MetricSpec, ...]
     clips: tuple[ClipRecord, ...]
     protocols: dict[str, ProtocolRecord]
+    """``metrics``, ``methods``, ``protocols``: In the order of the configuration; protocols by task, in files of
+    their own."""
     machine: dict[str, Any]
+    """Processor, cores, memory in bytes, system, package versions and accelerators; for a run on a CUDA device, also
+    the device, CUDA's version and whether TF32 was enabled. See `machine_record`."""
     status: Literal["started", "done"] = "started"
     adapted: tuple[AdaptedRecord, ...] = ()
+    """Clips that were adapted to a method."""
     seconds: float | None = None
     peak_memory_bytes: int | None = None
+    """``seconds``, ``peak_memory_bytes``: Of the last start of the run; None until it has ended."""
     capture_seconds: float | None = None
+    """Time that the demo took to make its capture."""
     unchecked: bool | None = None
+    """True if the captures were not searched for errors that change results: `headbench run --unchecked`."""
     format: Literal[3] = 3
 
     @classmethod
     def read(cls, path: Path) -> Manifest:
-        """Read ``run.json`` and its protocols. Raises `InputError` naming what is missing, unknown or of the wrong type."""
+        """Read ``run.json`` and its protocols."""
         record = read_json(path)
         if record.get("format") != 3:
             raise InputError(path, "format", "3", shown(record.get("format")), OLD)

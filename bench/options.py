@@ -15,19 +15,13 @@ class DependentOptions(NamedTuple):
     """Options that have an effect only if another setting has certain values.
 
     A dataclass of settings lists its own in the class variable ``dependent``.
-
-    Attributes
-    ----------
-    other : str
-        Name of the attribute that they depend on.
-    values : tuple[str, ...] | bool
-        Values of ``other`` with which the options have an effect. True: ``other`` is given; False: it
-        is not.
     """
 
     options: tuple[str, ...]
     other: str
+    """Name of the attribute that they depend on."""
     values: tuple[str, ...] | bool = True
+    """Values of ``other`` with which the options have an effect. True: ``other`` is given; False: it is not."""
 
 
 def check_dependent(

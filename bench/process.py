@@ -113,11 +113,6 @@ def run_program(
         An open file that the program inherits, so that a lock on it lasts as long as the program.
     hours : float | None
         Time limit; None for none.
-
-    Raises
-    ------
-    ProgramError
-        The command cannot be started, or takes longer than ``hours``.
     """
     until = math.inf if hours is None else time.monotonic() + 3600 * hours
     with log.open("ab") as stream:

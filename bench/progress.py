@@ -24,24 +24,16 @@ BAR_WIDTH, MOST_CELLS = 12, 8
 
 @dataclass(frozen=True)
 class Position:
-    """Progress of some work.
-
-    Attributes
-    ----------
-    text : str
-        Complete text in one line, for logs.
-    label : str
-        First line of a display.
-    share : float
-        Completed fraction, from 0 to 1.
-    cells : Mapping[str, str]
-        Activity of each running cell by name, one line each.
-    """
+    """Progress of some work."""
 
     text: str
+    """Complete text in one line, for logs."""
     label: str
+    """First line of a display."""
     share: float
+    """Completed fraction, from 0 to 1."""
     cells: Mapping[str, str] = field(default_factory=dict)
+    """Activity of each running cell by name, one line each."""
 
 
 class Display:

@@ -24,21 +24,14 @@ FOLDER = Path(__file__).with_name("protocols")
 
 @dataclass(frozen=True)
 class TaskFrames:
-    """The frames of a task that a protocol scores.
-
-    Attributes
-    ----------
-    cameras : Literal['all', 'seen', 'unseen']
-        All cameras, or those with or without training frames in the capture.
-    sequences : tuple[str, ...]
-        Prefixes of sequence names, such as "FREE"; () selects all held-out sequences.
-    last : int | None
-        Only this many timesteps at the end of each sequence.
-    """
+    """The frames of a task that a protocol scores."""
 
     cameras: Literal["all", "seen", "unseen"] = "all"
+    """All cameras, or those with or without training frames in the capture."""
     sequences: tuple[str, ...] = ()
+    """Prefixes of sequence names, such as "FREE"; () selects all held-out sequences."""
     last: int | None = None
+    """Only this many timesteps at the end of each sequence."""
 
     def __post_init__(self) -> None:
         """Refuse a number of timesteps below 1."""
@@ -52,48 +45,34 @@ class NamedProtocol:
 
     ``tasks``, ``region``, ``profile``, ``average`` and ``pooled`` select and combine values; the other fields describe how the
     published values were obtained, and tables list how a run differs.
-
-    Attributes
-    ----------
-    title, source : str
-        Paper or benchmark, and where its protocol was read.
-    tasks : Mapping[str, TaskFrames]
-        Scored frames by task: novel_view, self_reenactment.
-    region : str
-        Pixels for PSNR and SSIM: "full", "foreground", "face" or another region of the captures.
-    profile : str
-        Metric profile, see ``headbench list profiles``.
-    average : Literal['sequences', 'frames']
-        Whether every sequence of a subject has the same weight, or every frame.
-    pooled : int | None
-        Number of frames per value, with one mean squared error for PSNR; None for single frames.
-    subjects, training, test : str
-        Subjects, and the training and held-out sequences.
-    size : str
-        WIDTHxHEIGHT of the images, "" if it varies.
-    iterations : int | None
-        Training iterations of the paper's own method.
-    tracker, head_model : str
-        Tracker and head model of the driving signal.
-    test_refit : bool | None
-        Whether scored frames are fitted to their own pictures first, as under the condition test-refit; None if unknown.
     """
 
     title: str
     source: str
+    """``title``, ``source``: Paper or benchmark, and where its protocol was read."""
     tasks: Mapping[str, TaskFrames]
+    """Scored frames by task: novel_view, self_reenactment."""
     region: str = "full"
+    """Pixels for PSNR and SSIM: "full", "foreground", "face" or another region of the captures."""
     profile: str = "canonical"
+    """Metric profile, see ``headbench list profiles``."""
     average: Literal["sequences", "frames"] = "frames"
+    """Whether every sequence of a subject has the same weight, or every frame."""
     pooled: int | None = None
+    """Number of frames per value, with one mean squared error for PSNR; None for single frames."""
     subjects: str = ""
     training: str = ""
     test: str = ""
+    """``subjects``, ``training``, ``test``: Subjects, and the training and held-out sequences."""
     size: str = ""
+    """WIDTHxHEIGHT of the images, "" if it varies."""
     iterations: int | None = None
+    """Training iterations of the paper's own method."""
     tracker: str = ""
     head_model: str = ""
+    """``tracker``, ``head_model``: Tracker and head model of the driving signal."""
     test_refit: bool | None = None
+    """Whether scored frames are fitted to their own pictures first, as under the condition test-refit; None if unknown."""
 
     def __post_init__(self) -> None:
         """Refuse unknown tasks, none, and batches of less than one frame."""
@@ -114,15 +93,14 @@ def named_protocols() -> dict[str, NamedProtocol]:
 
 @cache
 def protocol_named(name: str) -> NamedProtocol:
-    """Look up a protocol. Raises `InputError` for an unknown one."""
+    """Look up a protocol."""
     return build_named(NamedProtocol, FOLDER, name, "--protocol")
 
 
 def needed(names: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of a run that measures everything protocols select: their tasks, profiles and regions besides the usual ones.
 
-    Given ``settings`` take precedence. Raises `InputError` for one that excludes what a protocol needs, and for
-    an unknown protocol.
+    Given ``settings`` take precedence.
     """
     wanted: dict[str, list[str]] = {"tasks": [], "metric_profiles": ["canonical"], "regions": []}
     for name in names:
@@ -180,40 +158,27 @@ extremes of synthetic captures, the ground truth is rendered."""
 
 @dataclass(frozen=True)
 class Protocol:
-    """Definition of a measurement. Everything that affects values is a field and thus part of the hash.
-
-    Attributes
-    ----------
-    task : TaskName | TaskWithoutTruth
-        The split whose frames are scored, or a task without ground truth.
-    keys : tuple[FrameKey, ...]
-        The scored frames, sorted. Every method renders exactly these.
-    excluded : tuple[tuple[FrameKey, str], ...]
-        Frames that are left out, with the reason.
-    clips : tuple[tuple[str, str], ...]
-        Fingerprint of each subject's clip (images, cameras and driving signal).
-    resolution : str
-        Image sizes of the truth at which metrics are computed, WIDTHxHEIGHT.
-    background : tuple[float, float, float]
-        Colour on which renders and ground truth are composited.
-    quantisation : str
-        Conversion of float renders to 8-bit frames.
-    metric_profile : str
-        The named set of metric definitions.
-    conditions : tuple[tuple[str, str], ...]
-        Further conditions that affect the numbers, by name: for tasks without ground truth, what is
-        rendered and the limits.
-    """
+    """Definition of a measurement. Everything that affects values is a field and thus part of the hash."""
 
     task: TaskName | TaskWithoutTruth
+    """The split whose frames are scored, or a task without ground truth."""
     keys: tuple[FrameKey, ...]
+    """The scored frames, sorted. Every method renders exactly these."""
     excluded: tuple[tuple[FrameKey, str], ...]
+    """Frames that are left out, with the reason."""
     clips: tuple[tuple[str, str], ...]
+    """Fingerprint of each subject's clip (images, cameras and driving signal)."""
     resolution: str
+    """Image sizes of the truth at which metrics are computed, WIDTHxHEIGHT."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Colour on which renders and ground truth are composited."""
     quantisation: str = "round-to-8-bit"
+    """Conversion of float renders to 8-bit frames."""
     metric_profile: str = "canonical"
+    """The named set of metric definitions."""
     conditions: tuple[tuple[str, str], ...] = ()
+    """Further conditions that affect the numbers, by name: for tasks without ground truth, what is rendered and the
+    limits."""
 
     @property
     def id(self) -> str:
@@ -237,11 +202,6 @@ def make_protocol(task: TaskName, clips: Sequence[Clip], max_frames: int | None 
     max_frames : int | None
         Maximum number of scored frames of each clip, evenly spaced over the sorted keys; None means
         all.
-
-    Raises
-    ------
-    InputError
-        A clip has no frames for the task, or a frame is also used for training.
     """
     keys: list[FrameKey] = []
     sizes: set[tuple[int, int]] = set()
@@ -287,8 +247,7 @@ def make_protocols(
 def joined_protocol(protocols: Sequence[Protocol]) -> Protocol:
     """Join the protocols of one task: the protocol of one run that scored all of their clips.
 
-    A subject in two of them must have the same frames and capture in both. Raises `InputError` for protocols that differ in
-    anything but their clips.
+    A subject in two of them must have the same frames and capture in both.
     """
     first = protocols[0]
     for protocol in protocols:
@@ -335,10 +294,7 @@ def make_protocol_without_truth(
     sizes: Iterable[tuple[int, int]],
     conditions: Mapping[str, str],
 ) -> Protocol:
-    """Make the protocol of a task without ground truth: frames of ``sizes`` (width, height), rendered as conditions describe.
-
-    Raises `InputError` for clips on different backgrounds.
-    """
+    """Make the protocol of a task without ground truth: frames of ``sizes`` (width, height), rendered as conditions describe."""
     return Protocol(
         task=task,
         keys=tuple(sorted(set(keys))),

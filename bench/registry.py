@@ -76,10 +76,7 @@ def discover(group: Group) -> dict[str, Plugin]:
 
 
 def get(group: Group, name: str) -> Any:
-    """Return the spec called ``name``, or named by ``"package.module:ATTRIBUTE"`` (a plug-in not yet packaged); no other is loaded.
-
-    Raises `InputError` for an unknown name (with the nearest one), `HeadbenchError` for a broken plug-in.
-    """
+    """Return the spec called ``name``, or named by ``"package.module:ATTRIBUTE"`` (a plug-in not yet packaged); no other is loaded."""
     if ":" in name:
         return _checked(resolve(name), group, name)
     entries = entry_points(group=f"headbench.{group}")

@@ -120,7 +120,7 @@ class Rows:
 
     @classmethod
     def read(cls, path: Path) -> Rows:
-        """Read rows that `write` wrote. Raises `InputError` for a file that is missing, not Parquet, or lacks a column."""
+        """Read rows that `write` wrote."""
         if not path.exists():
             raise InputError(path, "", "the rows of a finished run", "no such file", "Start the run again.")
         with open_regular(path, ROWS) as stream, reading(path, ROWS):

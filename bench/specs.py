@@ -28,24 +28,16 @@ def _check_labels(**texts: str) -> None:
 
 
 class Need(NamedTuple):
-    """A requirement of a method, metric or reader, and whether this machine has it (``headbench doctor``).
-
-    Attributes
-    ----------
-    what : str
-        Name of a kernel, package, file of weights, checkout or GPU.
-    found : str
-        What was found, such as a version; "" if it is missing.
-    remedy : str
-        How to install it if it is missing, and what happens without it.
-    required : bool
-        Whether nothing works without it. Otherwise some features are slower or missing.
-    """
+    """A requirement of a method, metric or reader, and whether this machine has it (``headbench doctor``)."""
 
     what: str
+    """Name of a kernel, package, file of weights, checkout or GPU."""
     found: str
+    """What was found, such as a version; "" if it is missing."""
     remedy: str = ""
+    """How to install it if it is missing, and what happens without it."""
     required: bool = True
+    """Whether nothing works without it. Otherwise some features are slower or missing."""
 
 
 @dataclass(frozen=True)
@@ -55,27 +47,19 @@ class ResolutionRule:
     Applied in this order: square, reduction, enlargement. ``square="pad", size=(2048, 2048)`` turns a capture
     of 550x802 into 2048x2048 for a method for 2K images; ``divide=4, multiply=4`` removes the detail of a 2K
     capture that other methods do not see.
-
-    Attributes
-    ----------
-    square : Literal['', 'pad', 'crop']
-        "pad" to the longer side with background, "crop" to the shorter one, or "" for neither;
-        centred. Pixels that a crop removes are scored as background.
-    divide : int
-        Factor of reduction: block means if it divides both sides, else antialiased bicubic.
-    multiply : int
-        Factor of enlargement, bicubic.
-    size : tuple[int, int] | None
-        (width, height) to resize to at the end, antialiased, instead of ``multiply``.
-    speed_size : tuple[int, int] | None
-        (width, height) at which frames per second are measured; None means the rendered size.
     """
 
     square: Literal["", "pad", "crop"] = ""
+    """"pad" to the longer side with background, "crop" to the shorter one, or "" for neither; centred. Pixels that a
+    crop removes are scored as background."""
     divide: int = 1
+    """Factor of reduction: block means if it divides both sides, else antialiased bicubic."""
     multiply: int = 1
+    """Factor of enlargement, bicubic."""
     size: tuple[int, int] | None = None
+    """(width, height) to resize to at the end, antialiased, instead of ``multiply``."""
     speed_size: tuple[int, int] | None = None
+    """(width, height) at which frames per second are measured; None means the rendered size."""
 
     def __post_init__(self) -> None:
         """Refuse invalid combinations."""
@@ -95,21 +79,14 @@ class ResolutionRule:
 
 @dataclass(frozen=True)
 class Mechanism:
-    """The learnt part of a method that its paper proposes, and that its avatars should show.
-
-    Attributes
-    ----------
-    name : str
-        What it is called.
-    meaning : str
-        The quantities of `ChangingAvatar.changes` that it changes, and of what.
-    ablation : str
-        The one of `MethodSpec.ablations` that turns it off.
-    """
+    """The learnt part of a method that its paper proposes, and that its avatars should show."""
 
     name: str
+    """What it is called."""
     meaning: str
+    """The quantities of `ChangingAvatar.changes` that it changes, and of what."""
     ablation: str
+    """The one of `MethodSpec.ablations` that turns it off."""
 
     def told(self, dynamic: float, condition: str = "") -> str:
         """Its name, whether it is off or left out by the condition, and its meaning; ``dynamic`` is a value of `DYNAMIC`."""
@@ -127,88 +104,59 @@ OFF = " off"
 
 @dataclass(frozen=True)
 class MethodSpec:
-    """Description of a method. Loading it imports neither torch nor the implementation.
-
-    Attributes
-    ----------
-    name : str
-        Name on the command line and in tables.
-    implementation : str
-        "package.module:Class"; the class takes the resolved configuration.
-    config : str
-        "package.module:Class" of the frozen dataclass with its settings, or "" for a method without
-        settings.
-    presets : Mapping[str, Mapping[str, Any]]
-        Settings by preset name. The key "budget" holds `Budget` fields; the rest are config fields.
-    head_models : tuple[str, ...]
-        Versions that the method accepts; empty means any.
-    monocular : bool
-        Whether the method needs the views as one video, one frame per timestep, with the rigid head
-        motion in the cameras.
-    conversion : Literal['required', 'published']
-        Why the method has ``head_models`` and ``monocular``: it works with nothing else, or they follow the publication
-        alone and `Condition.as_tracked` may leave the conversion out.
-    resolution : ResolutionRule
-        The image size that the method works at.
-    preset_resolutions : Mapping[str, ResolutionRule]
-        Resolution rules of presets that work at another size; see `at_preset`.
-    native : bool
-        Whether it is an implementation of this package; False for an adapter to an official
-        repository.
-    version : str
-        Version of the results. Raise it with each change of the code that changes results: a finished
-        avatar is kept as long as version, settings and data are the same. After a change of the code,
-        methods of this package give a warning; a run with an external plug-in is refused.
-    source, bibtex : str, str
-        The paper that describes the method, as text and as a BibTeX entry; "" for none.
-    trivial : bool
-        Whether it is a trivial baseline that every method should beat; shown in tables, never ranked.
-    default : bool
-        Whether a run that names no methods includes it.
-    variants : str
-        "package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]`` for
-        ``headbench run sweep``: variants of a trained avatar that need no training; "" for none.
-    ablations : Mapping[str, Mapping[str, Any]]
-        Settings by name that leave out or change one part of the method, for ``headbench run suite --ablations``.
-    mechanism : Mechanism | None
-        What the metric `DYNAMIC` measures; None for a method whose avatars do not show it (`ChangingAvatar`).
-    devices : tuple[str, ...]
-        Supported kinds of devices, such as "cpu"; empty means any. A run on another device is
-        refused.
-    renders : str
-        "package.module:function" of ``(folder, clip, listing) -> {FrameKey: Render}`` that maps
-        images written by the method's own program to frames (``headbench evaluate --names``), see
-        `bench.audit.naming`; ``listing`` is the capture's, see `DatasetSpec`. "" if no program
-        numbers its renders.
-    needs : str
-        "package.module:function" of ``(config, device) -> Iterable[Need]``: requirements of the
-        machine. The check takes little time, uses no network and writes nothing. "" if headbench's
-        own dependencies suffice.
-    """
+    """Description of a method. Loading it imports neither torch nor the implementation."""
 
     name: str
+    """Name on the command line and in tables."""
     summary: str
     implementation: str
+    """"package.module:Class"; the class takes the resolved configuration."""
     config: str = ""
+    """"package.module:Class" of the frozen dataclass with its settings, or "" for a method without settings."""
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Settings by preset name. The key "budget" holds `Budget` fields; the rest are config fields."""
     head_models: tuple[str, ...] = ()
+    """Versions that the method accepts; empty means any."""
     monocular: bool = False
+    """Whether the method needs the views as one video, one frame per timestep, with the rigid head motion in the
+    cameras."""
     conversion: Literal["required", "published"] = "required"
+    """Why the method has ``head_models`` and ``monocular``: it works with nothing else, or they follow the
+    publication alone and `Condition.as_tracked` may leave the conversion out."""
     native: bool = True
+    """Whether it is an implementation of this package; False for an adapter to an official repository."""
     version: str = "1"
+    """Version of the results. Raise it with each change of the code that changes results: a finished avatar is kept
+    as long as version, settings and data are the same. After a change of the code, methods of this package give a
+    warning; a run with an external plug-in is refused."""
     source: str = ""
     bibtex: str = ""
+    """``source``, ``bibtex``: The paper that describes the method, as text and as a BibTeX entry; "" for none."""
     trivial: bool = False
+    """Whether it is a trivial baseline that every method should beat; shown in tables, never ranked."""
     default: bool = False
+    """Whether a run that names no methods includes it."""
     demo: bool = False
     variants: str = ""
+    """"package.module:function" of ``(avatar folder, clip, device) -> Iterator[Variant]`` for ``headbench run
+    sweep``: variants of a trained avatar that need no training; "" for none."""
     ablations: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Settings by name that leave out or change one part of the method, for ``headbench run suite --ablations``."""
     mechanism: Mechanism | None = None
+    """What the metric `DYNAMIC` measures; None for a method whose avatars do not show it (`ChangingAvatar`)."""
     renders: str = ""
+    """"package.module:function" of ``(folder, clip, listing) -> {FrameKey: Render}`` that maps images written by the
+    method's own program to frames (``headbench evaluate --names``), see `bench.audit.naming`; ``listing`` is the
+    capture's, see `DatasetSpec`. "" if no program numbers its renders."""
     devices: tuple[str, ...] = ()
+    """Supported kinds of devices, such as "cpu"; empty means any. A run on another device is refused."""
     needs: str = ""
+    """"package.module:function" of ``(config, device) -> Iterable[Need]``: requirements of the machine. The check
+    takes little time, uses no network and writes nothing. "" if headbench's own dependencies suffice."""
     resolution: ResolutionRule = ResolutionRule()
+    """The image size that the method works at."""
     preset_resolutions: Mapping[str, ResolutionRule] = field(default_factory=dict)
+    """Resolution rules of presets that work at another size; see `at_preset`."""
 
     def __post_init__(self) -> None:
         """Refuse values that would make results unreadable."""
@@ -233,35 +181,7 @@ MetricKind = Literal["frame", "regional", "temporal", "sequence", "avatar", "mec
 
 @dataclass(frozen=True)
 class MetricSpec:
-    """Description of a metric.
-
-    Attributes
-    ----------
-    implementation : str
-        "package.module:function" for the given ``kind``; a class is instantiated without arguments.
-    kind : MetricKind
-        "frame", a `Metric`; "regional", a `RegionalMetric`; "temporal", a `TemporalMetric`; "sequence", a
-        `SequenceMetric`, whose value is assigned to each of the frames; "avatar",
-        an `AvatarMetric`; "mechanism", one whose workload is the poses of training; "training", a `TrainingMetric`.
-    detail : str
-        Key of the measurement's details that holds the value, in ``unit``; "" for the main value.
-        Metrics of an avatar with the same implementation are measured once, together.
-    tables : tuple[str, ...]
-        Names of the tables that show it.
-    machine_bound : bool
-        Whether the value depends on the machine and its load (speed, memory). It is compared on one
-        machine only, and another measurement gives another value.
-    profile : str
-        The set of definitions it belongs to, see `ProfileSpec`. Profiles other than the canonical one
-        are appended to the metric's name after an "@", for example ``ssim@3dgs``.
-    default : bool
-        Whether a run that names no metrics includes it. Not recorded in runs.
-    needs : str
-        As for a method, called with None for the config. Not recorded in runs.
-    suspect_above : float | None
-        Values of whole frames above it are marked as suspect in rows, tables and reports, since no measured method
-        exceeds it without access to the test images. Not recorded in runs.
-    """
+    """Description of a metric."""
 
     name: str
     label: str
@@ -269,15 +189,30 @@ class MetricSpec:
     higher_is_better: bool
     digits: int
     implementation: str
+    """"package.module:function" for the given ``kind``; a class is instantiated without arguments."""
     summary: str = ""
     kind: MetricKind = "frame"
+    """"frame", a `Metric`; "regional", a `RegionalMetric`; "temporal", a `TemporalMetric`; "sequence", a
+    `SequenceMetric`, whose value is assigned to each of the frames; "avatar", an `AvatarMetric`; "mechanism", one
+    whose workload is the poses of training; "training", a `TrainingMetric`."""
     detail: str = ""
+    """Key of the measurement's details that holds the value, in ``unit``; "" for the main value. Metrics of an avatar
+    with the same implementation are measured once, together."""
     tables: tuple[str, ...] = ("comparison",)
+    """Names of the tables that show it."""
     machine_bound: bool = False
+    """Whether the value depends on the machine and its load (speed, memory). It is compared on one machine only, and
+    another measurement gives another value."""
     profile: str = "canonical"
+    """The set of definitions it belongs to, see `ProfileSpec`. Profiles other than the canonical one are appended to
+    the metric's name after an "@", for example ``ssim@3dgs``."""
     default: bool = field(default=False, compare=False)
+    """Whether a run that names no metrics includes it. Not recorded in runs."""
     needs: str = field(default="", compare=False)
+    """As for a method, called with None for the config. Not recorded in runs."""
     suspect_above: float | None = field(default=None, compare=False)
+    """Values of whole frames above it are marked as suspect in rows, tables and reports, since no measured method
+    exceeds it without access to the test images. Not recorded in runs."""
 
     @property
     def per_frame(self) -> bool:
@@ -298,23 +233,16 @@ class MetricSpec:
 
 @dataclass(frozen=True)
 class ProfileSpec:
-    """A named set of metric definitions: what a library or the code of a paper prints under the usual names.
-
-    Attributes
-    ----------
-    name : str
-        Name in settings and metric names.
-    source : str
-        The code and version that computes these numbers.
-    metrics : tuple[MetricSpec, ...]
-        Metrics with this `MetricSpec.profile`, each named ``<metric>@<profile>`` and shown in the
-        profile's own table, ``tables=(profile,)``. Names of the canonical profile have no suffix.
-    """
+    """A named set of metric definitions: what a library or the code of a paper prints under the usual names."""
 
     name: str
+    """Name in settings and metric names."""
     summary: str
     source: str
+    """The code and version that computes these numbers."""
     metrics: tuple[MetricSpec, ...]
+    """Metrics with this `MetricSpec.profile`, each named ``<metric>@<profile>`` and shown in the profile's own table,
+    ``tables=(profile,)``. Names of the canonical profile have no suffix."""
 
     def __post_init__(self) -> None:
         """Refuse metrics that could be confused with those of another profile."""
@@ -363,35 +291,25 @@ class DatasetSpec:
 
 @dataclass(frozen=True)
 class ConditionSpec:
-    """A registered change that the conditions of a run refer to by name, see `bench.condition.Condition`.
-
-    Attributes
-    ----------
-    name, summary : str
-        Name used in conditions, and description.
-    kind : str
-        "clip": ``implementation`` names a function ``(clip, config, **parameters) -> clip``, where ``config`` is the
-        `RunConfig`; it stores results of slow steps in ``config.out``.
-        "derive": a function ``(method spec, avatar folder, folder to write, clip, device, **parameters) -> Avatar``.
-        "drive": a function ``(job, avatar, progress, **parameters) -> (Rows, details)`` that writes below the run folder.
-        Details are JSON values.
-        "views": a function ``(avatar, clip, key, background, **parameters) -> (camera, pose)`` of a scored frame, whose
-        picture it can read; the values are not comparable with those of tracked views.
-    implementation : str
-        "package.module:function".
-    protocols : str
-        "package.module:function" for kind "drive": ``(jobs, **parameters) -> protocols``, called once for all jobs of
-        methods with equal needs; see `bench.protocol.protocol_name` for their names.
-    metrics : tuple of MetricSpec
-        Metrics that a change of kind "drive" measures.
-    """
+    """A registered change that the conditions of a run refer to by name, see `bench.condition.Condition`."""
 
     name: str
     summary: str
+    """``name``, ``summary``: Name used in conditions, and description."""
     kind: Literal["clip", "derive", "drive", "views"]
+    """"clip": ``implementation`` names a function ``(clip, config, **parameters) -> clip``, where ``config`` is the
+    `RunConfig`; it stores results of slow steps in ``config.out``. "derive": a function ``(method spec, avatar
+    folder, folder to write, clip, device, **parameters) -> Avatar``. "drive": a function ``(job, avatar, progress,
+    **parameters) -> (Rows, details)`` that writes below the run folder. Details are JSON values. "views": a function
+    ``(avatar, clip, key, background, **parameters) -> (camera, pose)`` of a scored frame, whose picture it can read;
+    the values are not comparable with those of tracked views."""
     implementation: str
+    """"package.module:function"."""
     protocols: str = ""
+    """"package.module:function" for kind "drive": ``(jobs, **parameters) -> protocols``, called once for all jobs of
+    methods with equal needs; see `bench.protocol.protocol_name` for their names."""
     metrics: tuple[MetricSpec, ...] = ()
+    """Metrics that a change of kind "drive" measures."""
 
 
 @dataclass(frozen=True)

@@ -226,8 +226,6 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     """Score a folder of images or a stored avatar, without a plug-in.
 
     The text is the table, together with the run named by ``like``.
-
-    Raises `InputError` for invalid settings, captures or images, before anything is written.
     """
     if settings.execution.executor != "inline":
         out = Path(settings.out)
@@ -366,13 +364,6 @@ def find_images(
         Naming scheme of the images, see `named_renders`; "" names them by frame key.
     config : RunConfig | None
         Configuration that opened the captures; required with ``names``.
-
-    Raises
-    ------
-    InputError
-        The folder or images are missing (with their number and the first expected path), or an image
-        is not 8-bit RGB, not fully opaque, or differs in size from the ground truth. Also raised by
-        `named_renders`.
     """
     if not folder.is_dir():
         raise InputError(folder, "", "a folder of images", "no such folder")

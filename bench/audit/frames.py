@@ -49,13 +49,6 @@ def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[C
     """Image of each frame by ``names``: a method whose program numbers its renders, or the path of a CSV file.
 
     The images of a subject are in a folder named after it or, with a single subject, in ``folder``. See `MethodSpec.renders`.
-
-    Raises
-    ------
-    InputError
-        The name is unknown, the list does not fit the captures, the number of images differs from
-        that of the frames, or the ground truth stored with the images differs from that of their
-        frames.
     """
     if names.endswith(".csv"):
         return _listed(Path(names), folder, clips)
@@ -81,11 +74,7 @@ def image_name(task: str, key: FrameKey) -> PurePosixPath:
 
 
 def check_truth(clip: Clip, renders: Renders, keys: Iterable[FrameKey], count: int = 8) -> None:
-    """Compare the ground truth stored with renders with the clip's in some frames, on black if the renders are on black.
-
-    Raises `InputError` if they differ by more than `TRUTH_RMS`, as for renders of other frames or on another
-    background.
-    """
+    """Compare the ground truth stored with renders with the clip's in some frames, on black if the renders are on black."""
     chosen = [key for key in sorted(keys) if key in renders and renders[key].truth is not None]
     for key in chosen[:: max(1, len(chosen) // count)]:
         path = renders[key].truth
@@ -212,11 +201,7 @@ POSE_COLUMNS = (
 
 @command("frames", group="compare", writes="out")
 def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> CommandResult:
-    """List the frames that `evaluate` scores: file names, cameras, pose files.
-
-    Raises `InputError` if the path is neither a run nor a capture, for options that require a capture, and
-    for an edited `MAP_FILE`.
-    """
+    """List the frames that `evaluate` scores: file names, cameras, pose files."""
     config, clips = _open(settings)
     protocols = make_protocols(config.tasks, clips, config.frames_per_task)
     by_subject = {clip.subject: clip for clip in clips}

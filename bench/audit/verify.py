@@ -106,10 +106,7 @@ def verify_runs(settings: VerifySettings, progress: Progress = no_progress) -> C
 
 
 def verify(run: Path, settings: VerifySettings, progress: Progress = no_progress) -> Findings:
-    """Compare captures, protocols, avatars and values of a run with its record.
-
-    Raises `InputError` if it is not a finished run of stored frames, or its capture cannot be opened.
-    """
+    """Compare captures, protocols, avatars and values of a run with its record."""
     folder, found = RunFolder(run), Findings()
     manifest = folder.read_manifest()
     manifest.check_done(folder.manifest)

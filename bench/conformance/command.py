@@ -331,10 +331,7 @@ TIMESTEPS = 4  # of the generated capture
 
 @command("doctor check", group="validate")
 def check_plugin(settings: CheckPluginSettings, progress: Progress = no_progress) -> CommandResult:
-    """Check a method, reader or metric against its contract.
-
-    Raises `InputError` for wrong usage, and `HeadbenchError` where the plug-in cannot be imported.
-    """
+    """Check a method, reader or metric against its contract."""
     spec, kind = _find(settings)
     values = parse_assignments(settings.set)
     breaches: list[str] = []

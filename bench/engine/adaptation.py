@@ -39,22 +39,15 @@ class MethodNeeds:
 
 @dataclass(frozen=True, eq=False)
 class AdaptedClip:
-    """A clip adapted to a method, and the mapping back to the frames of the protocol.
-
-    Attributes
-    ----------
-    clip : Clip
-        Clip that the method is trained on; its cameras and poses are rendered.
-    key : Callable
-        Maps a frame key of the protocol to its key in ``clip``.
-    restore : Callable
-        Maps a protocol key and the (H, W, 3) float render of that frame in ``clip`` to the render at
-        the protocol's size, before quantisation.
-    """
+    """A clip adapted to a method, and the mapping back to the frames of the protocol."""
 
     clip: Clip
+    """Clip that the method is trained on; its cameras and poses are rendered."""
     key: Callable[[FrameKey], FrameKey] = lambda key: key
+    """Maps a frame key of the protocol to its key in ``clip``."""
     restore: Callable[[FrameKey, FloatArray], FloatArray] = lambda key, rgb: rgb
+    """Maps a protocol key and the (H, W, 3) float render of that frame in ``clip`` to the render at the protocol's
+    size, before quantisation."""
 
 
 Adaptation = Callable[[Path, Progress], AdaptedClip]
@@ -75,11 +68,6 @@ def plan(clip: Clip, needs: MethodNeeds, heads: Mapping[str, str]) -> Adaptation
 
     For a monocular method the steps are applied even to a single view, since they also move the head's rigid
     motion into the cameras.
-
-    Raises
-    ------
-    InputError
-        The clip lacks what the method needs, and no registered step provides it.
     """
     fits = not needs.head_models or clip.head.version in needs.head_models
     if fits and needs.resolution.native and not needs.monocular:

@@ -31,9 +31,6 @@ def open_clips(config: RunConfig, *, use_cache: bool = True, only: int | None = 
 
     ``use_cache`` is False to read every byte, ignoring the reader's cache. ``only`` is
     the index of a single capture to open, None for all.
-
-    Raises `InputError` for a folder without captures, a setting the reader does not know or of the wrong type,
-    subjects that are not distinct, and errors that the reader finds.
     """
     spec: DatasetSpec = get("datasets", config.reader)
     root = Path(config.data)
@@ -53,10 +50,7 @@ def open_clips(config: RunConfig, *, use_cache: bool = True, only: int | None = 
 def found_captures(
     spec: DatasetSpec, root: Path, settings: Mapping[str, Any], *, use_cache: bool = True
 ) -> list[tuple[Path, Callable[[Progress], Clip]]]:
-    """Path of each capture that a reader finds under ``root``, and its reader.
-
-    Raises `InputError` if there is no capture, or if the reader or its settings are unknown.
-    """
+    """Path of each capture that a reader finds under ``root``, and its reader."""
     if not spec.reads:
         raise InputError("reader", spec.name, "a dataset that is read", "one that makes captures")
     read = resolve(spec.implementation)
@@ -78,10 +72,7 @@ def found_captures(
 
 
 def reader_of(root: str) -> str:
-    """Name of the reader for a run's capture: ga, unless only another reader finds one.
-
-    Raises `InputError` if several other readers find one.
-    """
+    """Name of the reader for a run's capture: ga, unless only another reader finds one."""
     if not Path(root).exists() or finds(get("datasets", "ga"), Path(root)):
         return "ga"
     found = [name for name, spec in readers().items() if finds(spec, Path(root))]
@@ -113,11 +104,7 @@ def capture_configuration(
 
 
 def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dict[str, Any]:
-    """All settings that reproduce the synthetic capture of one subject, from the steps recorded in its clip.
-
-    Raises `InputError` for a capture that is not synthetic, not of the procedural head, or made with unknown
-    settings.
-    """
+    """All settings that reproduce the synthetic capture of one subject, from the steps recorded in its clip."""
     make = resolve(get("datasets", "synthetic").implementation)
     where, given = f"capture of {subject}", ("out", "pictures", "only", "execution", "workers", "progress")
     parameters = steps[0].get("parameters") if steps else None
@@ -209,12 +196,6 @@ def run_configuration(
     """Settings of a run with the current locations of its folder and files.
 
     For ``used`` see `open_run_clips`, for ``given`` `check_trusted`.
-
-    Raises
-    ------
-    InputError
-        The folder is not a run, plug-ins require `RunOptions.trust`, or a capture or another file is
-        neither where the run found it nor named by an option.
     """
     folder = RunFolder(run)
     config = replace(folder.read_manifest().configuration, out=str(run))
@@ -255,12 +236,6 @@ def open_run_clips(
         Plug-ins that the caller resolves from the returned settings. Names that would import a module
         are refused only for these and for the reader, since opening captures needs neither methods
         nor metrics.
-
-    Raises
-    ------
-    InputError
-        A capture's fingerprint differs from the run's, unless ``altered``. Also raised by
-        `run_configuration` and `open_clips`.
     """
     config = run_configuration(run, options, used)
     config = config if out is None else replace(config, out=str(out))
@@ -299,7 +274,7 @@ def _named(config: RunConfig) -> dict[str, str]:
 
 
 def changed(clip: Clip, change: Named, config: RunConfig) -> Clip:
-    """Apply a registered change to a clip; without a change, return the clip. Raises `InputError` as `resolve_change` does."""
+    """Apply a registered change to a clip; without a change, return the clip."""
     result: Clip = resolve_change(change, "clip")(clip, config)
     return result
 

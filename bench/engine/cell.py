@@ -154,10 +154,7 @@ def write_losses(job: Job) -> None:
 
 
 def derive(job: Job) -> Avatar:
-    """Use the avatar of the job's ``source``, or derive one from it by the condition, without training.
-
-    Raises `InputError` if the source has no trained avatar.
-    """
+    """Use the avatar of the job's ``source``, or derive one from it by the condition, without training."""
     assert job.source is not None
     derived_from = source_fingerprint(job)
     record: dict[str, Any] = {"fingerprint": job.fit_fingerprint, "derived_from": derived_from}

@@ -36,71 +36,49 @@ def default_names(group: Literal["methods", "metrics"]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Settings of ``headbench run``, as in its YAML file.
-
-    Attributes
-    ----------
-    data : str
-        Folder of one capture or of several.
-    out : str
-        Output folder of the run.
-    methods : tuple[str, ...]
-        Names of registered methods, or "package.module:SPEC".
-    preset : str
-        Name of the settings: smoke, demo, fast, paper, or another that every method defines.
-    seeds : tuple[int, ...]
-        One avatar is trained for each seed.
-    tasks, metrics : tuple[TaskName, ...] or tuple[str, ...]
-        Tasks and metrics to evaluate.
-    metric_profiles : tuple[str, ...]
-        Sets of metric definitions, see ``headbench list profiles``.
-    regions : tuple[str, ...] | None
-        Regions to evaluate besides the whole frame, for metrics that support them. Default: the face,
-        if the capture's reader provides it.
-    reader : str
-        Dataset reader that opens the captures.
-    reader_settings : dict[str, Any]
-        Settings of the reader (for example ``head``: path of the head model).
-    frames_per_task : int | None
-        Maximum number of scored frames per subject and task, evenly spaced. Default: all.
-    device : str
-        "cpu", "cuda", ...
-    settings : dict[str, dict[str, Any]]
-        Settings by method that override the preset; the key ``budget`` holds iterations and seconds.
-    divide : int
-        Factor by which all images are reduced first, by area means. Metrics are computed at the
-        reduced size.
-    heads : dict[str, str]
-        Files of further head models by version, for methods that need another model than the one used
-        for tracking; the tracking is refitted.
-    conditions : tuple[Condition, ...]
-        Variations of the comparison; each adds its own cells, see `Condition`.
-    clip : Named
-        Registered change of every capture, including the scored frames, such as other held-out
-        frames.
-    source : str
-        Folder of a finished run whose avatars, trained under the same conditions, are used instead of training; "" trains.
-    """
+    """Settings of ``headbench run``, as in its YAML file."""
 
     data: str
+    """Folder of one capture or of several."""
     out: str
+    """Output folder of the run."""
     methods: tuple[str, ...] = field(default_factory=partial(default_names, "methods"))
+    """Names of registered methods, or "package.module:SPEC"."""
     preset: str = "fast"
+    """Name of the settings: smoke, demo, fast, paper, or another that every method defines."""
     seeds: tuple[int, ...] = (0,)
+    """One avatar is trained for each seed."""
     tasks: tuple[TaskName, ...] = ("novel_view", "self_reenactment")
+    """Tasks to evaluate."""
     metrics: tuple[str, ...] = field(default_factory=partial(default_names, "metrics"))
+    """Metrics to evaluate."""
     metric_profiles: tuple[str, ...] = ("canonical",)
+    """Sets of metric definitions, see ``headbench list profiles``."""
     regions: tuple[str, ...] | None = None
+    """Regions to evaluate besides the whole frame, for metrics that support them. Default: the face, if the capture's
+    reader provides it."""
     reader: str = "ga"
+    """Dataset reader that opens the captures."""
     reader_settings: dict[str, Any] = field(default_factory=dict)
+    """Settings of the reader (for example ``head``: path of the head model)."""
     frames_per_task: int | None = None
+    """Maximum number of scored frames per subject and task, evenly spaced. Default: all."""
     device: str = "cpu"
+    """"cpu", "cuda", ..."""
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Settings by method that override the preset; the key ``budget`` holds iterations and seconds."""
     divide: int = 1
+    """Factor by which all images are reduced first, by area means. Metrics are computed at the reduced size."""
     heads: dict[str, str] = field(default_factory=dict)
+    """Files of further head models by version, for methods that need another model than the one used for tracking;
+    the tracking is refitted."""
     conditions: tuple[Condition, ...] = (PLAIN,)
+    """Variations of the comparison; each adds its own cells, see `Condition`."""
     clip: Named = field(default_factory=Named)
+    """Registered change of every capture, including the scored frames, such as other held-out frames."""
     source: str = ""
+    """Folder of a finished run whose avatars, trained under the same conditions, are used instead of training; ""
+    trains."""
 
     def __post_init__(self) -> None:
         """Refuse invalid settings early."""
@@ -214,10 +192,7 @@ class ResolvedMethod:
 
 
 def resolve_methods(config: RunConfig) -> list[ResolvedMethod]:
-    """Resolve every method of a run.
-
-    Raises `InputError` for unknown methods, presets and settings, and for methods that do not support the run's device.
-    """
+    """Resolve every method of a run."""
     forget_code()
     specs: list[MethodSpec] = [get("methods", name) for name in config.methods]
     for name, count in Counter(spec.name for spec in specs).items():
@@ -250,10 +225,7 @@ def with_methods(config: RunConfig, names: Collection[str]) -> RunConfig:
 
 
 def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:
-    """Resolve every method of a run under each condition that applies to it, method by method.
-
-    Raises `InputError` as `resolve_methods` does, and for a condition of a method that the run does not have.
-    """
+    """Resolve every method of a run under each condition that applies to it, method by method."""
     methods = resolve_methods(config)
     names = [method.spec.name for method in methods]
     for change, kind in (
@@ -294,7 +266,7 @@ def resolve_cells(config: RunConfig) -> list[tuple[ResolvedMethod, Condition]]:
 
 
 def _unconverted(spec: MethodSpec, condition: str) -> MethodSpec:
-    """Return the method without its conversion of head model and views. Raises `InputError` if it requires the conversion."""
+    """Return the method without its conversion of head model and views."""
     if spec.conversion == "required" and (spec.head_models or spec.monocular):
         expected = f"methods that work without the conversion of captures, for condition {condition}"
         raise InputError("settings", "conditions, methods", expected, spec.name)
@@ -305,10 +277,7 @@ KINDS = ("clip", "derive", "drive", "views")
 
 
 def resolve_change(change: Named, kind: str) -> Callable[..., Any]:
-    """The function of a registered change with its parameters bound; the identity for no change.
-
-    Raises `InputError` for a change that is not registered or of another kind, and for parameters that it does not have.
-    """
+    """The function of a registered change with its parameters bound; the identity for no change."""
     if not change:
         return lambda value, *others: value
     where = f"conditions, {change.name}"
@@ -360,11 +329,6 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
     Metrics of the avatar as a whole, and those that no profile defines, keep their registered definition. The
     metrics of the first profile are in the comparison table, those of each further profile in a table named
     after it.
-
-    Raises
-    ------
-    InputError
-        A metric or profile is unknown, or no requested profile defines a metric.
     """
     forget_code()
     if config.drive:
@@ -497,7 +461,7 @@ def coded_conditions(methods: Collection[str]) -> tuple[Condition, ...]:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Read ``WIDTHxHEIGHT``. Raises `InputError` for anything else."""
+    """Read ``WIDTHxHEIGHT``."""
     match = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
     if match is None or min(int(match[1]), int(match[2])) < 16:
         raise InputError("size", "", "WIDTHxHEIGHT in pixels, each at least 16, such as 275x401", repr(text))

@@ -182,10 +182,7 @@ class Job:
 
 
 def source_fingerprint(job: Job) -> str:
-    """Fingerprint of the trained avatar of the job's ``source``.
-
-    Raises `InputError` where there is none, and for one that was trained with other settings or on another capture.
-    """
+    """Fingerprint of the trained avatar of the job's ``source``."""
     assert job.source is not None
     record, identity = trained_record(job.source), job.method.identity()
     if not job.source.avatar.is_dir():
@@ -204,7 +201,7 @@ def source_fingerprint(job: Job) -> str:
 
 
 def trained_record(cell: Cell) -> CellRecord:
-    """The record of a cell. Raises `InputError` without a complete avatar."""
+    """The record of a cell."""
     record = cell.record
     if record.get("state") != "trained":
         found = "one whose training did not end" if "state" in record else "none"
@@ -248,11 +245,6 @@ def make_plan(
         Open captures of the configuration; resolved cells and metrics, if the configuration does not name them.
     scratch : Path, optional
         Folder to write instead of ``config.out``, see `make_jobs`.
-
-    Raises
-    ------
-    InputError
-        Settings, methods or captures are invalid, or the folder holds a run of another configuration.
     """
     folder = RunFolder(Path(config.out))
     cells = resolve_cells(config) if cells is None else cells
@@ -286,10 +278,7 @@ def make_plan(
 
 
 def check_settings(cells: Iterable[tuple[ResolvedMethod, Condition]]) -> None:
-    """Create the method of each cell, so that its settings are checked before any long step.
-
-    Raises `InputError` for settings that a method refuses, and whatever importing or creating it raises.
-    """
+    """Create the method of each cell, so that its settings are checked before any long step."""
     for method, _ in cells:
         if not method.spec.implementation:
             continue  # a folder of images
@@ -347,11 +336,6 @@ def make_jobs(
     out : Path, optional
         Locked folder for results of slow adaptations of clips; those stored in ``folder`` are copied
         there first, since commands that read a run do not write to it. Default: ``folder`` itself.
-
-    Raises
-    ------
-    InputError
-        A clip has no such region or cannot be adapted to a method.
     """
     regions = {clip.subject: check_regions(clip, config.regions) if protocols else () for clip in clips}
     source = RunFolder(Path(config.source)) if config.source else None
@@ -466,12 +450,6 @@ def trained(run: Path, methods: Sequence[str], options: RunOptions, out: Path) -
         Current locations of the run's files.
     out : Path
         Locked folder for adapted clips; replaces ``out`` of the settings.
-
-    Raises
-    ------
-    InputError
-        The run has no such method or no avatar, a capture differs from the one used for training, or
-        an avatar is missing or its training did not finish.
     """
     folder = RunFolder(run)
     resolved = [cell for cell in resolve_cells(run_configuration(run, options)) if not cell[1].name]

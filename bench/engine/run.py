@@ -86,11 +86,6 @@ def run(
         Write the registered reports at the end.
     record : Any
         Values to add to the manifest.
-
-    Raises
-    ------
-    OSError
-        The disk is full or read-only; finished cells are kept.
     """
     start = time.perf_counter()
     config, execution = located(config), execution or Execution()
@@ -331,7 +326,7 @@ class _Opened:
     def job(
         self, run: Path, subject: str, label: str, seed: int, capture: int
     ) -> tuple[Job, Sequence[MetricSpec]]:
-        """A cell and the metrics of its run. Raises `InputError` if the capture has changed since the run began."""
+        """A cell and the metrics of its run."""
         if self._run is None or self._run.folder.root != run:
             self._run = _Run.read(run)
             self._clips = []

@@ -44,11 +44,11 @@ class TrainingView:
         self.steps, self.fingerprint = tuple(clip.steps), clip.fingerprint
 
         def image(key: FrameKey) -> ByteArray:
-            """(H, W, 3) 8-bit sRGB of a training frame. Raises `HeadbenchError` for any other."""
+            """(H, W, 3) 8-bit sRGB of a training frame."""
             return _copied(clip.image(_checked(key)))
 
         def mask(key: FrameKey) -> ByteArray | None:
-            """(H, W) 8-bit coverage of a training frame. Raises `HeadbenchError` for any other."""
+            """(H, W) 8-bit coverage of a training frame."""
             found = clip.mask(_checked(key))
             return None if found is None else _copied(found)
 
@@ -140,10 +140,7 @@ def make_metric(spec: MetricSpec, device: str = "cpu") -> Any:
 
 
 def check_regions(clip: Clip, wanted: Sequence[str] | None) -> tuple[str, ...]:
-    """Names of the regions to evaluate besides the whole frame; None requests the face if the clip has it.
-
-    Raises `InputError` for regions that the clip does not have.
-    """
+    """Names of the regions to evaluate besides the whole frame; None requests the face if the clip has it."""
     known = tuple(clip.region_names) if isinstance(clip, RegionalClip) else ()
     if wanted is None:
         return ("face",) if "face" in known else ()
@@ -174,11 +171,6 @@ def score_frames(
         missing for every method alike.
     device : str
         Device of the run; see `make_metric`.
-
-    Raises
-    ------
-    HeadbenchError
-        A value is not finite.
     """
     scored: dict[str, list[Score]] = {}
     metrics = {spec.name: make_metric(spec, device) for spec in specs}

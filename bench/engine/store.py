@@ -35,39 +35,26 @@ from ..rows import Rows
 
 
 class CellRecord(TypedDict, total=False):
-    """Content of ``cell.json``.
-
-    Attributes
-    ----------
-    state : Literal["training", "trained"]
-        Whether the avatar is complete. Only a complete avatar is rendered.
-    fingerprint : str
-        Digest of everything that the avatar depends on.
-    method : dict[str, Any]
-        Method and settings of the training, see `ResolvedMethod.record`.
-    training : dict[str, Any]
-        Times, memory, load and interruptions of the training; empty for a derived avatar.
-    derived_from : str
-        Fingerprint of the trained avatar from which this one was derived without training.
-    measured : list[str]
-        Metrics whose rows are complete.
-    details : dict[str, dict[str, Any]]
-        Details of the measurements by metric.
-    codec : str
-        Codec of the measured avatar, see `CodedAvatar`.
-    task : TaskOutcome
-        Of the process or job of the cell.
-    """
+    """Content of ``cell.json``."""
 
     state: Literal["training", "trained"]
+    """Whether the avatar is complete. Only a complete avatar is rendered."""
     fingerprint: str
+    """Digest of everything that the avatar depends on."""
     method: dict[str, Any]
+    """Method and settings of the training, see `ResolvedMethod.record`."""
     training: dict[str, Any]
+    """Times, memory, load and interruptions of the training; empty for a derived avatar."""
     derived_from: str
+    """Fingerprint of the trained avatar from which this one was derived without training."""
     measured: list[str]
+    """Metrics whose rows are complete."""
     details: dict[str, dict[str, Any]]
+    """Details of the measurements by metric."""
     codec: str
+    """Codec of the measured avatar, see `CodedAvatar`."""
     task: TaskOutcome
+    """Of the process or job of the cell."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +82,7 @@ class Cell:
 
     @property
     def record(self) -> CellRecord:
-        """``cell.json``, empty without one. Raises `InputError` for a damaged record."""
+        """``cell.json``, empty without one."""
         try:
             return checked(read_record(self.folder), CellRecord, self.file)  # type: ignore[no-any-return]
         except InputError as error:
@@ -148,16 +135,13 @@ class RunFolder:
         return Cell(self.root / subject / method / f"seed-{seed}")
 
     def read_manifest(self) -> Manifest:
-        """Read ``run.json``. Raises `InputError` if it is missing or has another format."""
+        """Read ``run.json``."""
         if not self.manifest.exists():
             raise InputError(self.root, "run.json", "the folder of a run", "no run.json")
         return Manifest.read(self.manifest)
 
     def read_rows(self, manifest: Manifest) -> Rows:
-        """Read ``rows.parquet`` with the label of method and condition as the method, see `Rows.labelled`.
-
-        Raises `InputError` for rows of methods, metrics and tasks that the run does not have.
-        """
+        """Read ``rows.parquet`` with the label of method and condition as the method, see `Rows.labelled`."""
         rows = Rows.read(self.rows).labelled()
         for what, found, known in (
             ("method", rows.methods, {method.label for method in manifest.methods}),

@@ -39,43 +39,28 @@ Maker = Literal["training", "import", "compact", "variant"]
 
 
 class AvatarRecord(TypedDict):
-    """Content of ``avatar.json``.
-
-    Attributes
-    ----------
-    format : Literal[1]
-        Format of this file.
-    method : str
-        Registered name of the method that reads the avatar. ``version`` is that of the method that
-        wrote it.
-    settings : dict[str, Any] | None
-        Complete configuration of the method; None for a method without settings.
-    resolution : ResolutionRule
-        Image size that the method uses with these settings.
-    subject, shape : str or list[float]
-        Name and (S,) identity coefficients of the subject.
-    head_model : str
-        Version of the head model whose poses animate the avatar.
-    head_digest : str
-        SHA-256 of `HEAD_FILE` in the same folder; "" without one.
-    made_by : Maker
-        "training", "import" of another program's file, "compact" storage, or derived as a "variant".
-    origin : dict[str, Any]
-        Inputs of the avatar: seed, budget and fingerprint of the capture, or digest of the file or
-        avatar.
-    """
+    """Content of ``avatar.json``."""
 
     format: Literal[1]
+    """Format of this file."""
     method: str
+    """Registered name of the method that reads the avatar. ``version`` is that of the method that wrote it."""
     version: str
     settings: dict[str, Any] | None
+    """Complete configuration of the method; None for a method without settings."""
     resolution: ResolutionRule
+    """Image size that the method uses with these settings."""
     subject: str
     shape: list[float]
+    """``subject``, ``shape``: Name and (S,) identity coefficients of the subject."""
     head_model: str
+    """Version of the head model whose poses animate the avatar."""
     head_digest: str
+    """SHA-256 of `HEAD_FILE` in the same folder; "" without one."""
     made_by: Maker
+    """"training", "import" of another program's file, "compact" storage, or derived as a "variant"."""
     origin: dict[str, Any]
+    """Inputs of the avatar: seed, budget and fingerprint of the capture, or digest of the file or avatar."""
 
 
 def write_avatar_record(
@@ -118,7 +103,7 @@ def registered_name(method: ResolvedMethod) -> str:
 
 
 def avatar_folder(folder: Path) -> Path:
-    """The folder with the files of an avatar: this one, or ``avatar`` in the cell of a run. Raises `InputError`."""
+    """The folder with the files of an avatar: this one, or ``avatar`` in the cell of a run."""
     inside = folder / "avatar"
     found = inside if inside.is_dir() else folder
     if not found.is_dir() or not any(path.is_file() for path in entries(found)):
@@ -136,7 +121,7 @@ class StoredAvatar:
     method: ResolvedMethod
 
     def load(self, device: str = "cpu") -> Avatar:
-        """Read the avatar. Raises `InputError` for damaged files or another head model than the recorded one."""
+        """Read the avatar."""
         head, known = self.folder / HEAD_FILE, self.record["head_digest"]
         if known and not head.is_file():
             raise InputError(head, "", "the head model that the avatar was stored with", "no such file")
@@ -176,12 +161,6 @@ def open_avatar(folder: Path, method: str = "") -> StoredAvatar:
     ----------
     method : str
         "module:SPEC" of a method that is not registered; "" uses the name in ``avatar.json``.
-
-    Raises
-    ------
-    InputError
-        ``avatar.json`` is missing or invalid, the method or its settings are unknown, or the avatar
-        was derived as a variant.
     """
     home = avatar_folder(folder)
     path = home / AVATAR_FILE
@@ -235,17 +214,12 @@ def load_avatar(folder: Path | str, *, device: str = "cpu", method: str = "") ->
         Rendering device.
     method : str
         "module:SPEC" of a method that is not registered; "" uses the name in ``avatar.json``.
-
-    Raises
-    ------
-    InputError
-        Raised by `open_avatar` and `StoredAvatar.load`.
     """
     return open_avatar(Path(folder), method).load(device)
 
 
 def training_losses(folder: Path) -> list[tuple[int, float]]:
-    """Recorded losses of an avatar's training, possibly none. Raises `InputError` for a damaged record."""
+    """Recorded losses of an avatar's training, possibly none."""
     path = folder / TRAINING_FILE
     if not path.is_file():
         return []

@@ -64,7 +64,7 @@ def submitted_path(root: Path) -> Path:
 
 
 def read_submitted(root: Path) -> Submitted | None:
-    """Read the jobs of tasks; None without a list. Raises `InputError` for a damaged list."""
+    """Read the jobs of tasks; None without a list."""
     path = submitted_path(root)
     if not path.exists():
         return None
@@ -109,7 +109,7 @@ class Slurm:
         return self._running
 
     def submit(self, tasks: Sequence[Task]) -> None:
-        """Submit jobs. Raises `InputError` with Slurm's message if it refuses them."""
+        """Submit jobs."""
         left = []
         for task in tasks:
             known = self._known.pop(task.place, None)
@@ -302,7 +302,7 @@ def end_of(number: str) -> _State:
 
 
 def _ask(*command: str) -> str:
-    """Output of a Slurm command. Raises `HeadbenchError` if it fails."""
+    """Output of a Slurm command."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_S, check=True)
     except subprocess.CalledProcessError as error:

@@ -35,22 +35,16 @@ SHOWN = 30
 
 @dataclass(frozen=True)
 class CellState:
-    """Current state of a cell.
-
-    Attributes
-    ----------
-    note : str
-        Current activity, reason for waiting, or reason of the failure.
-    seconds : float | None
-        Time spent so far; None if unknown.
-    """
+    """Current state of a cell."""
 
     subject: str
     method: str
     seed: int
     state: State
     note: str = ""
+    """Current activity, reason for waiting, or reason of the failure."""
     seconds: float | None = None
+    """Time spent so far; None if unknown."""
     restarts: int = 0
 
     @property

@@ -71,11 +71,6 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Comm
     The trained avatars are measured again with their variants, so that frame times are comparable. Writes
     ``points.csv`` and ``pareto.png`` into the run folder. A restart keeps existing measurements and adds
     variants.
-
-    Raises
-    ------
-    InputError
-        The folder is not a finished run, a method derives no variants, or no method has the variant.
     """
     execution, source = settings.execution, RunFolder(Path(settings.run))
     source.read_manifest()  # before a folder is created
@@ -123,10 +118,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Comm
 
 
 def variant(method: MethodSpec, trained: Path, out: Path, clip: Clip, device: str, *, name: str) -> Avatar:
-    """Create a named variant of a trained avatar, see `MethodSpec.variants`; the registered change "variant".
-
-    Raises `InputError` if the avatar has no such variant.
-    """
+    """Create a named variant of a trained avatar, see `MethodSpec.variants`; the registered change "variant"."""
     known = []
     for each in resolve(method.variants)(trained, clip, device):
         if each.name == name:
@@ -241,13 +233,6 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
 
     Writes ``curve.csv`` and ``curve.png`` into the run folder of all trainings. A restart keeps finished
     trainings; an interrupted training starts over, since its time is measured.
-
-    Raises
-    ------
-    InputError
-        The folder is not a finished run or has trainings with other settings, the run has no such
-        method or the method has no budget, or a capture differs from the run's or has too few frames
-        to hold some out.
     """
     execution, source = settings.execution, RunFolder(Path(settings.run))
     manifest = source.read_manifest()

@@ -143,8 +143,7 @@ RECORD_FILE = "record.json"
 def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -> CommandResult:
     """Render views and poses beyond training; check against ground truth and stability limits.
 
-    Does not pass if a limit is broken or an avatar failed. A restart keeps finished work. Raises `InputError`
-    for a folder that is not a finished run, and for a capture that is not the run's.
+    Does not pass if a limit is broken or an avatar failed. A restart keeps finished work.
     """
     return _run(settings, "extremes", "extremes")
 
@@ -153,9 +152,7 @@ def extremes_run(settings: ExtremesSettings, progress: Progress = no_progress) -
 def reenact_run(settings: ReenactSettings, progress: Progress = no_progress) -> CommandResult:
     """Drive avatars with another subject's expressions; check stability limits.
 
-    Does not pass if a limit is broken or an avatar failed. A restart keeps finished work. Raises `InputError`
-    for a folder that is not a finished run, without another subject, and for a source tracked with another
-    head model.
+    Does not pass if a limit is broken or an avatar failed. A restart keeps finished work.
     """
     return _run(settings, "reenact", "cross_reenactment")
 
@@ -219,24 +216,17 @@ VIEWS_PER_SAMPLE = 2
 
 @dataclass(frozen=True, eq=False)
 class PoseComponents:
-    """Principal components of expression and jaw together, each scaled to a total variance of 1 over the training poses.
-
-    Attributes
-    ----------
-    mean, low, high : FloatArray
-        (E + 3,) mean and range of expression and jaw.
-    directions : FloatArray
-        (D, E + 3) change of both by one standard deviation along each component, by decreasing deviation. D is less than
-        requested if the training poses span fewer dimensions.
-    reach : FloatArray
-        (2, D) minimum and maximum over training poses along each component, in standard deviations.
-    """
+    """Principal components of expression and jaw together, each scaled to a total variance of 1 over the training poses."""
 
     mean: FloatArray
     low: FloatArray
     high: FloatArray
+    """``mean``, ``low``, ``high``: (E + 3,) mean and range of expression and jaw."""
     directions: FloatArray
+    """(D, E + 3) change of both by one standard deviation along each component, by decreasing deviation. D is less
+    than requested if the training poses span fewer dimensions."""
     reach: FloatArray
+    """(2, D) minimum and maximum over training poses along each component, in standard deviations."""
 
     @classmethod
     def of(cls, poses: Sequence[HeadPose], dimensions: int) -> PoseComponents:

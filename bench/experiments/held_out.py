@@ -38,10 +38,7 @@ def tracking_error(steps: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def with_tracking_error(clip: Clip, config: RunConfig, *, level: float) -> Clip:
-    """The clip of a capture with the same images and another level of tracking error, which is made in ``config.out``.
-
-    Raises `InputError` for a capture that is not synthetic.
-    """
+    """The clip of a capture with the same images and another level of tracking error, which is made in ``config.out``."""
     steps = [asdict(step) for step in clip.steps]
     if tracking_error(steps) is None:
         expected = "a synthetic capture, to track with other errors"
@@ -85,11 +82,11 @@ class HeldOutClip:
     fingerprint: str
 
     def image(self, key: FrameKey) -> ByteArray:
-        """(H, W, 3) 8-bit sRGB. Raises `HeadbenchError` for a frame that is in none of the splits."""
+        """(H, W, 3) 8-bit sRGB."""
         return self.source.image(self._checked(key))
 
     def mask(self, key: FrameKey) -> ByteArray | None:
-        """(H, W) 8-bit coverage or None. Raises `HeadbenchError` for a frame that is in none of the splits."""
+        """(H, W) 8-bit coverage or None."""
         return self.source.mask(self._checked(key))
 
     @cached_property
@@ -112,11 +109,6 @@ def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", e
         there is only one.
     every : int
         The middle one of each group of ``every`` consecutive training timesteps is held out.
-
-    Raises
-    ------
-    InputError
-        The camera is not a training camera, or no frame remains for training or for evaluation.
     """
     train = clip.splits["train"]
     where = f"clip {clip.subject}"

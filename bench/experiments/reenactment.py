@@ -287,11 +287,7 @@ class Driven:
 
 
 def protocols(jobs: Sequence[Job], **parameters: Any) -> dict[str, Protocol]:
-    """The protocols of the registered change "reenact".
-
-    Raises `InputError` if there is no other subject, one has no held-out performance, the head models differ,
-    or the camera is missing.
-    """
+    """The protocols of the registered change "reenact"."""
     pairs = [driven for job in jobs for driven in _pairs(job, **parameters)]
     if not pairs:
         found = ", ".join(sorted({job.clip.subject for job in jobs}))
@@ -405,7 +401,7 @@ def _sources(job: Job, source: str | None) -> Sequence[Job]:
 
 
 def view_camera(clip: Clip, wanted: str | None) -> Camera:
-    """The camera of a name; None: the first held-out one, or else the first. Raises `InputError` for an unknown name."""
+    """The camera of a name; None: the first held-out one, or else the first."""
     if wanted is None:
         keys = clip.splits.get("novel_view") or clip.splits["train"]
         return clip.cameras[min(key.camera for key in keys)]

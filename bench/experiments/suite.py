@@ -169,11 +169,6 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
 
     Every subject has its own run, with conditions. Subjects run one after another, and the tables of ``results.md`` are written
     after each. Images of twice the size have separate captures and runs, since means over subjects need equal sizes.
-
-    Raises
-    ------
-    InputError
-        Methods, presets and sizes do not match; raised before the first capture is created.
     """
     out, execution = Path(settings.out), settings.execution
     methods = settings.methods or tuple(
@@ -275,10 +270,7 @@ def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
 
 
 def _ablations(option: str, asked: Sequence[str], specs: dict[str, MethodSpec]) -> list[Condition]:
-    """The requested ablations in the order of the methods' specs; the one of ours if several methods have the name.
-
-    Raises `InputError` for unknown ones, and for `ALL` without ours.
-    """
+    """The requested ablations in the order of the methods' specs; the one of ours if several methods have the name."""
     if ALL in asked and OURS not in specs:
         expected = f"{OURS} among them, whose {option} are all"
         raise InputError("command line", "--methods", expected, ", ".join(specs))

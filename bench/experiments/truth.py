@@ -36,29 +36,21 @@ NOT_FINITE = "the frame is not finite"
 
 @dataclass(frozen=True)
 class TruthLimits:
-    """Limits on the difference of a frame from the ground truth.
-
-    Attributes
-    ----------
-    blur, blur_beyond : float
-        PSNR and LPIPS must be at least as good as for the ground truth after a Gaussian blur relative to the image's height;
-        the second is for views beyond the training cameras, where no training frame shows the hair.
-    iou : float
-        Minimum overlap of alpha and the true mask.
-    colour : float
-        Maximum CIEDE2000 difference of the face's mean colours.
-    response : float
-        Minimum fraction of the ground truth's change from the typical pose that the avatar shows.
-    flicker : float
-        Maximum flicker relative to the ground truth's change, which is the flicker of a static avatar.
-    """
+    """Limits on the difference of a frame from the ground truth."""
 
     blur: float = 0.015
     blur_beyond: float = 0.04
+    """``blur``, ``blur_beyond``: PSNR and LPIPS must be at least as good as for the ground truth after a Gaussian
+    blur relative to the image's height; the second is for views beyond the training cameras, where no training frame
+    shows the hair."""
     iou: float = 0.9
+    """Minimum overlap of alpha and the true mask."""
     colour: float = 5.0
+    """Maximum CIEDE2000 difference of the face's mean colours."""
     response: float = 0.25
+    """Minimum fraction of the ground truth's change from the typical pose that the avatar shows."""
     flicker: float = 1.5
+    """Maximum flicker relative to the ground truth's change, which is the flicker of a static avatar."""
 
 
 TRUTH_LIMITS = TruthLimits()

@@ -76,12 +76,6 @@ def read_results(root: Path) -> Results:
 
     A number is the mean over the frames of a sequence, then over sequences, then over seeds. It is present
     only if every frame of the protocol has a value, for every seed.
-
-    Raises
-    ------
-    InputError
-        The run is not finished, its rows cannot be read, or they belong to other protocols than the
-        manifest's.
     """
     folder = RunFolder(root)
     manifest = folder.read_manifest()
@@ -215,11 +209,7 @@ class Baseline:
     def of(
         cls, results: Results, earlier: Baseline | None = None, captures: Captures | None = None
     ) -> Baseline:
-        """Make the baseline of some results, keeping the tolerances of an ``earlier`` one.
-
-        Raises `InputError` if a number is missing that could be available, since the baseline would hide that
-        later.
-        """
+        """Make the baseline of some results, keeping the tolerances of an ``earlier`` one."""
         if results.problems or not results.values:
             problem = next(iter(results.problems.items()), ("rows", "no numbers"))
             raise InputError(results.source, str(problem[0]), "a number for everything measured", problem[1])
@@ -242,7 +232,7 @@ class Baseline:
 
     @classmethod
     def read(cls, path: Path) -> Baseline:
-        """Read a baseline file. Raises `InputError` naming what is missing or malformed.
+        """Read a baseline file.
 
         A file without numbers to judge, or with fewer than it declares, is refused because everything would
         pass.

@@ -34,12 +34,6 @@ def read_pickle(path: str | PathLike[str]) -> dict[str, Any]:
     -------
     dict[str, Any]
         The dictionary: arrays (also 0-d, for numpy scalars), strings, numbers, plain lists; dictionaries with text keys.
-
-    Raises
-    ------
-    InputError
-        The file is missing, truncated, or not a pickle of such a dictionary, or it names a global
-        that NumPy, scipy.sparse and chumpy arrays do not need. Nothing in the file is executed.
     """
     path = Path(path)
     return _content(path, read_bytes(path, EXPECTED), EXPECTED, REMEDY)
@@ -166,31 +160,20 @@ _KINDS = "biufU"
 
 @dataclass(frozen=True)
 class Member:
-    """Requirements of an array.
-
-    Attributes
-    ----------
-    kinds : str
-        Letters of NumPy type kinds; "U" is text.
-    shape : tuple[int | str | None, ...] | None
-        For each axis its size, a name for a size that is shared, or None for any size; None allows
-        any shape.
-    most : float | None
-        Largest magnitude. Floating-point numbers must be finite in any case.
-    least : float | None
-        Smallest number; ``-most`` by default.
-    dtype : str
-        Required type; "" allows any type of ``kinds``.
-    optional : bool
-        Whether the file may lack the member.
-    """
+    """Requirements of an array."""
 
     kinds: str = "f"
+    """Letters of NumPy type kinds; "U" is text."""
     shape: tuple[int | str | None, ...] | None = None
+    """For each axis its size, a name for a size that is shared, or None for any size; None allows any shape."""
     most: float | None = None
+    """Largest magnitude. Floating-point numbers must be finite in any case."""
     dtype: str = ""
+    """Required type; "" allows any type of ``kinds``."""
     optional: bool = False
+    """Whether the file may lack the member."""
     least: float | None = None
+    """Smallest number; ``-most`` by default."""
 
 
 TEXT = Member("U", ())
@@ -202,8 +185,7 @@ def read_arrays(
 ) -> dict[str, np.ndarray]:
     """Read an npz and check the described members; others are returned unchecked.
 
-    ``sizes`` gives sizes of the axes named in ``members``. Raises `InputError` as `read_npz` does, and for
-    the first member that is missing or not as described.
+    ``sizes`` gives sizes of the axes named in ``members``.
     """
     content = read_npz(path)
     check_arrays(path, content, members, sizes)
@@ -259,7 +241,7 @@ def check_arrays(
     members: Mapping[str, Member],
     sizes: Mapping[str, int] | None = None,
 ) -> dict[str, int]:
-    """Check arrays by name; return the sizes of the named axes. Raises `InputError` as `read_arrays` does."""
+    """Check arrays by name; return the sizes of the named axes."""
     known = dict(sizes or {})
     for name, member in members.items():
         if name in content:
@@ -316,7 +298,7 @@ def _check(
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Read every member of an npz: numbers, truth values and text in the machine's byte order.
 
-    Nothing is unpickled. Raises `InputError` for a file that is missing, damaged, or not an npz of such arrays.
+    Nothing is unpickled.
     """
     expected = "an npz file of plain arrays"
     with open_regular(path, expected) as stream, reading(path, expected):

@@ -38,11 +38,7 @@ _DAMAGE = (yaml.YAMLError, ValueError, KeyError, IndexError, RecursionError)
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file whose top level is an object.
-
-    Raises `InputError` for a file that is missing, cannot be read, is invalid, has duplicate keys or non-finite
-    numbers, or is not an object.
-    """
+    """Read a JSON file whose top level is an object."""
     return parse_json(read_text(path, "JSON"), path)
 
 
@@ -61,8 +57,7 @@ def parse_json(text: str | bytes, source: Source, key: str = "") -> dict[str, An
 def read_yaml(path: Path) -> dict[Any, Any]:
     """Read a YAML mapping; an empty file is an empty mapping. It is read as data, never as code.
 
-    Supported types are text, numbers, true and false, null, lists and mappings. Raises `InputError` as
-    `read_json` does, and for other tags.
+    Supported types are text, numbers, true and false, null, lists and mappings.
     """
     value = parse_setting(read_text(path, "YAML"), path, "")
     with reading(path, "valid YAML"):  # a list may contain itself
@@ -127,11 +122,6 @@ def checked(value: Any, kind: type[T], source: Source, prefix: str = "", *, fore
     foreign : bool
         Whether this is another program's format, whose unknown entries are ignored. They are refused
         otherwise.
-
-    Raises
-    ------
-    InputError
-        An entry is missing, unknown, or of the wrong type or range.
     """
     from pydantic import ValidationError
 
@@ -241,8 +231,7 @@ def _listed(value: Any) -> Any:
 def read_text(path: Path, what: str) -> str:
     """Read a UTF-8 text file, with or without a byte order mark; line ends are not changed.
 
-    ``what`` names the format in errors. Raises `InputError` for a file that is missing, cannot be read, or has another
-    encoding.
+    ``what`` names the format in errors.
     """
     article = f"a {what} file"
     content = read_bytes(path, article)

@@ -40,13 +40,6 @@ def atomic_path(path: Path) -> Iterator[Path]:
     The content is on disk before the rename, so that there are no partial files after a kill or a power failure, and a
     disk that is full raises. The temporary name keeps the suffix, since many writers choose their format by it. A link at
     ``path`` is replaced, not followed.
-
-    Raises
-    ------
-    InputError
-        The folder is, through a link, outside of the one given to `output_inside`.
-    OSError
-        The file cannot be written; ``filename`` is ``path``.
     """
     _check_target(path)
     check_inside(path.parent)
@@ -144,10 +137,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write `json_text` of a value atomically.
-
-    Raises `InputError` for a name of a file that is not in UTF-8, which could not be read back.
-    """
+    """Write `json_text` of a value atomically."""
     text = json_text(value)
     if "\\ud" in text:
         check_utf8(json.dumps(json.loads(text), ensure_ascii=False), path, "", "names")
@@ -173,10 +163,7 @@ def check_utf8(text: str, source: str | os.PathLike[str], key: str, what: str) -
 
 
 def check_writable(path: Path, option: str) -> None:
-    """Make sure, before long work, that a file can be written at ``path``, in a folder that exists.
-
-    Raises `InputError`, naming the ``option`` that asked for the file.
-    """
+    """Make sure, before long work, that a file can be written at ``path``, in a folder that exists."""
     marks = {pattern.rpartition("/")[2] for patterns in KINDS.values() for pattern in patterns}
     if path.is_symlink() or (path.exists() and path.name in marks | RESULTS):
         found = "a link" if path.is_symlink() else "a file of a run or a capture"
@@ -190,7 +177,7 @@ def check_writable(path: Path, option: str) -> None:
 
 
 def check_output_folder(folder: Path) -> None:
-    """Make sure, before any work, that the folder of ``--out`` can be made and written. Raises `InputError`.
+    """Make sure, before any work, that the folder of ``--out`` can be made and written.
 
     A folder that does not exist yet is not left behind.
     """
@@ -332,7 +319,7 @@ def _words(error: Exception) -> str:
 
 @contextmanager
 def open_regular(path: Path, expected: str) -> Iterator[BinaryIO]:
-    """Open a file for reading bytes. Raises `InputError`, which names what was ``expected``, for anything else.
+    """Open a file for reading bytes.
 
     Pipes and devices, which might never end, are refused immediately.
     """
@@ -347,17 +334,13 @@ def open_regular(path: Path, expected: str) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: Path, expected: str) -> bytes:
-    """A file's content. Raises `InputError` as `open_regular` does."""
+    """A file's content."""
     with open_regular(path, expected) as stream, reading(path, expected):
         return stream.read()
 
 
 def check_name(name: str, file: str | os.PathLike[str], key: str) -> str:
-    """Return an untrusted name if it is valid as one part of a path, since folders are named after it.
-
-    Raises `InputError` for an empty name, one that starts with a dot or is longer than `MAX_NAME_BYTES`, and
-    one with a slash, a backslash, a colon or a control character, which could refer to another folder.
-    """
+    """Return an untrusted name if it is valid as one part of a path, since folders are named after it."""
     unfit = any(character in "/\\:" or not character.isprintable() for character in name)
     if not name or name.startswith(".") or unfit or len(name.encode(errors="replace")) > MAX_NAME_BYTES:
         expected = f"a name without slashes, colons and leading dots, of 1 to {MAX_NAME_BYTES} bytes"
@@ -391,10 +374,7 @@ def user_files(folder: Path, pattern: str = "*") -> list[Path]:
 
 
 def expand_home(text: str, source: str) -> str:
-    """Replace ``~`` or ``~user`` at the start of a path by the home folder, as a shell does; leave other text alone.
-
-    Raises `InputError`, naming the ``source`` of the path, if the home folder is unknown.
-    """
+    """Replace ``~`` or ``~user`` at the start of a path by the home folder, as a shell does; leave other text alone."""
     if not re.match(r"~($|[\w.-]*/)", text):
         return text
     path = os.path.expanduser(text)

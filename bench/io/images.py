@@ -179,8 +179,7 @@ def probe_image(path: Path, *, decode: bool = False) -> ImageInfo:
     """Read the size of a PNG or JPEG and check that the file is complete.
 
     Needs only a few small reads; ``decode`` also decodes the pixels, which detects damage in the middle. Bytes after the end
-    of the image are ignored. Raises `InputError` for a missing, empty, foreign or truncated file, more than 8 bits per
-    channel, an animation and a CMYK JPEG.
+    of the image are ignored.
     """
     with open_regular(path, "an image file") as stream:
         info = _header(path, stream)
@@ -202,11 +201,6 @@ def read_pixels(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
     ByteArray
         8-bit (H, W) grey, (H, W, 3) BGR, or (H, W, 4) BGR with straight alpha if the file has
         transparency.
-
-    Raises
-    ------
-    InputError
-        The file is refused by `probe_image`, has another size, or is too damaged to be decoded.
     """
     with open_regular(path, "an image file") as stream:
         info = _header(path, stream)
@@ -302,9 +296,7 @@ def _is_whole(stream: BinaryIO, format: str) -> bool:
 def quantise(rgb: FloatArray) -> ByteArray:
     """Round colours in [0, 1] to the nearest 8-bit level; values outside are clamped.
 
-    Truncating (``rgb * 255`` cast to an integer) would darken by half a level on average. Raises `InputError`
-    for a non-finite colour, since any level would hide a bug of the renderer, and for an array that is not
-    floating point.
+    Truncating (``rgb * 255`` cast to an integer) would darken by half a level on average.
     """
     if not np.issubdtype(rgb.dtype, np.floating):
         raise InputError("render", "rgb", "a floating-point array in [0, 1]", str(rgb.dtype))
@@ -318,8 +310,7 @@ def quantise(rgb: FloatArray) -> ByteArray:
 def encode_image(image: ByteArray, suffix: str, options: Sequence[int] = (), *, place: Path | str) -> bytes:
     """Encode (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA, 8-bit, in the format that the suffix names.
 
-    ``options`` are OpenCV's, ``place`` is named in errors. Raises `InputError` if the format cannot represent
-    the image.
+    ``options`` are OpenCV's, ``place`` is named in errors.
     """
     order = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}.get(image.shape[2]) if image.ndim == 3 else None
     try:
@@ -345,7 +336,7 @@ def write_png(path: Path, image: ByteArray, kind: str = "") -> bytes:
 
 
 def read_bgr(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
-    """Read an (H, W, 3) 8-bit image in BGR order, without its alpha. Raises `InputError` as `read_pixels` does."""
+    """Read an (H, W, 3) 8-bit image in BGR order, without its alpha."""
     pixels = read_pixels(path, size)
     if pixels.ndim == 3 and pixels.shape[2] == 3:
         return pixels
@@ -354,7 +345,7 @@ def read_bgr(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
 
 
 def read_png(path: Path) -> ByteArray:
-    """Read an (H, W, 3) 8-bit sRGB image, without its alpha. Raises `InputError` as `read_pixels` does."""
+    """Read an (H, W, 3) 8-bit sRGB image, without its alpha."""
     pixels = read_pixels(path)
     orders = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
     order = orders[1 if pixels.ndim == 2 else pixels.shape[2]]

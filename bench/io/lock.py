@@ -28,12 +28,6 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
     The lock ends with its process: the file of a killed process locks nobody out. While locked, temporary files of
     killed processes are removed, and nothing is written through links out of the folder. ``beside`` creates the lock
     file beside the folder, for folders that must be empty. A new folder without content is removed.
-
-    Raises
-    ------
-    InputError
-        Another process works in the folder (the message gives process, host and time), the folder
-        cannot be created, or its lock file is a link.
     """
     path = folder.resolve().parent / f".{folder.resolve().name}.lock" if beside else folder / LOCK_FILE
     check_inside(folder)
