@@ -9,7 +9,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal, TypeAlias
 
 import tyro
 
@@ -28,7 +27,8 @@ from ..io.lock import locked
 from ..options import DependentOptions
 from ..registry import get, resolve
 from ..specs import CommandResult, MethodSpec, command
-from .held_out import CAMERA, TIMESTEPS, count_of
+from .held_out import CAMERA, TIMESTEPS, count_of, hold_out
+from .specs import Over
 
 
 @dataclass(frozen=True)
@@ -111,10 +111,9 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Comm
         )
         clips = list({job.clip.subject: job.clip for job in able}.values())
         run(config, execution, clips=clips, is_locked=True, reports=False)
-        shown: CommandResult = resolve(get("reports", "pareto").implementation)(
-            (str(out),), out, settings.task, settings.metric, settings.time
-        )
-        return shown
+        from ...reports.pareto.command import pareto
+
+        return pareto((str(out),), out, settings.task, settings.metric, settings.time)
 
 
 def variant(method: MethodSpec, trained: Path, out: Path, clip: Clip, device: str, *, name: str) -> Avatar:
@@ -132,7 +131,6 @@ MOST_TRACKING_ERROR = 4.0
 FRACTIONS = ("1/16", "1/8", "1/4", "1/2", "1")
 LEVELS = (0.0, 1.0, 2.0)
 SECONDS, PICTURES = (5.0, 30.0, 120.0), (1, 4, 16)
-Over: TypeAlias = Literal["budget", "seconds", "cameras", "timesteps", "pictures", "tracking_error"]
 
 
 @dataclass(frozen=True)
@@ -256,7 +254,6 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
             regions=(),
             source="",
         )
-        hold_out = resolve(get("conditions", held.name).implementation)
         clips: list[Clip] = [hold_out(clip, config, **held.parameters) for clip in opened]
         tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in clips))
         config = replace(config, tasks=tasks, conditions=tuple(conditions(settings, wanted, clips)))
@@ -264,8 +261,9 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
         _drop_interrupted(out)
         unchecked = bool(manifest.unchecked)  # for a run whose captures have errors
         run(config, execution, clips=clips, is_locked=True, reports=False, unchecked=unchecked)
-        found: CommandResult = resolve(get("reports", "curve").implementation)(out, settings.over)
-        return found
+        from ...reports.curve.curve import curve_report
+
+        return curve_report(out, settings.over)
 
 
 def conditions(

@@ -28,6 +28,7 @@ from ..protocol import Protocol
 from ..registry import get, resolve
 from ..rows import ALL, Rows
 from ..specs import CommandResult, command
+from .specs import RECORD_FILE
 from .stability import (
     EXPRESSION_LIMITS,
     VIEW_LIMITS,
@@ -135,7 +136,6 @@ class ReenactSettings(RunOptions, ExecutionOptions):
         return {"source": self.source, "camera": self.camera, "frames": self.frames}
 
 
-RECORD_FILE = "record.json"
 """File with settings, limits, protocols and results of each avatar."""
 
 
@@ -175,8 +175,9 @@ def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) ->
         clips = list({job.clip.subject: job.clip for job in jobs}.values())
         rows = run(config, execution, clips=clips, is_locked=True, reports=False).rows
         _write_record(out, drive, rows, settings.others)
-        shown: CommandResult = resolve(get("reports", "robustness").implementation)(out)
-        return shown
+        from ...reports.robustness.sheets import robustness_report
+
+        return robustness_report(out)
 
 
 def _write_record(out: Path, drive: str, rows: Rows, settings: dict[str, Any]) -> None:

@@ -28,7 +28,6 @@ from ..errors import HeadbenchError, InputError
 from ..io.files import digest
 from ..progress import progress
 from ..protocol import evenly
-from ..registry import get, resolve
 
 
 def tracking_error(steps: Sequence[Mapping[str, Any]]) -> float | None:
@@ -49,9 +48,10 @@ def with_tracking_error(clip: Clip, config: RunConfig, *, level: float) -> Clip:
     )  # folder of one subject, or of all
     capture = Path(config.out) / f"capture-tracking-{level:g}"
     arguments = {**synthesis_arguments(steps, clip.subject), "tracking_error": level}
-    make = resolve(get("datasets", "synthetic").implementation)
+    from ...datasets.synthetic.capture import synthesize  # imports torch
+
     with progress(f"tracking with error {level:g}") as report:
-        make(capture, **arguments, pictures=pictures, progress=report)
+        synthesize(capture, **arguments, pictures=pictures, progress=report)
     place = capture if pictures == data else capture / data.name
     return next(c for c in open_clips(replace(config, data=str(place))) if c.subject == clip.subject)
 

@@ -1,8 +1,22 @@
-"""Conditions that the experiments register; light to import."""
+"""Conditions that the experiments register, and names that reports share; light to import."""
 
 from __future__ import annotations
 
+from typing import Literal, TypeAlias
+
 from ..specs import ConditionSpec, MetricSpec
+
+Over: TypeAlias = Literal["budget", "seconds", "cameras", "timesteps", "pictures", "tracking_error"]
+"""What `run curve` varies."""
+RECORD_FILE = "record.json"
+"""Results of `run extremes` and `run reenact`."""
+
+TRACKED, LEVEL, AS_TRACKED, EQUAL = "tracked", "tracking-{:g}", "as-tracked", "equal-iterations"
+"""Conditions of the suite: tracking estimated from images; a level of simulated tracking errors; the capture's own tracking
+without conversion; the same number of iterations as ga."""
+RUN, LARGE_RUN, SEEDS_RUN = "run", "run-large", "run-seeds"
+"""Folders of a suite's runs, each with one folder per subject. Runs in the second have images of twice the size, those in
+the third other training seeds."""
 
 HOLD_OUT = ConditionSpec(
     name="hold-out",

@@ -25,25 +25,19 @@ from ..errors import InputError
 from ..executors.settings import ExecutionOptions, check_executor
 from ..io.files import write_text
 from ..listing import presets_of_methods
-from ..registry import discover, get, resolve
+from ..registry import discover
 from ..specs import CommandResult, MethodSpec, command
 from .extremes import ExtremesSettings, extremes_run
+from .specs import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, SEEDS_RUN, TRACKED
 
 SEED = 39_000
 """Seed of the suite's captures. Methods are tuned on captures with seeds below 10,000 (`docs/explanation/suite.md`)."""
 
 ALL, NONE = "all", "none"
 
-TRACKED, LEVEL, AS_TRACKED, EQUAL = "tracked", "tracking-{:g}", "as-tracked", "equal-iterations"
-"""Names of conditions: tracking estimated from images; a level of simulated tracking errors; the capture's own tracking
-without conversion; the same number of iterations as `EQUAL_TO`."""
 EQUAL_TO = "ga"
 TRACKED_METHODS = ("ga", "gbs", "ours", "ours-plus")
-"""Default methods of the first two conditions."""
-
-RUN, LARGE_RUN, SEEDS_RUN = "run", "run-large", "run-seeds"
-"""Folders of a suite's runs, each with one folder per subject. Runs in the second have images of twice the size, those in
-the third other training seeds."""
+"""Default methods of the conditions `TRACKED` and `LEVEL`."""
 
 
 @dataclass(frozen=True)
@@ -170,6 +164,9 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
     Every subject has its own run, with conditions. Subjects run one after another, and the tables of ``results.md`` are written
     after each. Images of twice the size have separate captures and runs, since means over subjects need equal sizes.
     """
+    from ...datasets.synthetic.capture import synthesize  # imports torch
+    from ...reports.suite.suite import suite_report
+
     out, execution = Path(settings.out), settings.execution
     methods = settings.methods or tuple(
         name for name, plugin in discover("methods").items() if plugin.spec and plugin.spec.demo
@@ -202,7 +199,7 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         if place < settings.large:
             parts.append((large, (2 * width, 2 * height)))
         for part, size in parts:
-            (capture,) = resolve(get("datasets", "synthetic").implementation)(
+            (capture,) = synthesize(
                 part.data,
                 subjects=settings.subjects,
                 only=place,
@@ -225,8 +222,7 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
                 how = {name: getattr(settings, name) for name in ("executor", "workers", "set")}
                 extremes_run(ExtremesSettings(own.out, **how), progress)
             ends.append(closing(runs[-1], rows))
-            text = resolve(get("reports", "suite").implementation)(out, OURS)
-            write_text(out / "results.md", text)
+            write_text(out / "results.md", suite_report(out, OURS))
     data = {"out": out, "runs": runs, "failed": sorted({*failed})}
     return CommandResult(
         "\n\n".join([f"Tables of all results: {out / 'results.md'}", *ends]), data, not failed

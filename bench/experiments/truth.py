@@ -23,7 +23,7 @@ from ..errors import InputError, UnavailableError
 from ..io.files import digest
 from ..io.images import quantise, read_png, write_png
 from ..io.provenance import SYNTHETIC
-from ..registry import get, resolve
+from ..registry import get
 from ..rows import FULL
 from .stability import FACE, NO_FACE, LimitCheck, absent_surface
 
@@ -72,7 +72,9 @@ class TruthPictures:
         clip = job.form.clip
         place = f"truth of {clip.fingerprint}"
         if place not in job.kept:
-            job.kept[place] = resolve(get("datasets", "synthetic").truth)(clip)
+            from ...datasets.synthetic.truth import SyntheticTruth  # imports torch
+
+            job.kept[place] = SyntheticTruth(clip)
         return cls(job.kept[place], job.run / FOLDER, next(iter(job.clip.cameras.values())).height)
 
     @property

@@ -19,8 +19,8 @@ from matplotlib.axes import Axes
 from ...bench.condition import Condition
 from ...bench.contracts import Budget, FloatArray, FrameKey, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.experiments.curve import Over
 from ...bench.experiments.held_out import tracking_error
+from ...bench.experiments.specs import Over
 from ...bench.io.files import write_text
 from ...bench.manifest import ClipRecord, MethodRecord
 from ...bench.rows import ALL, FULL, Rows

@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from ...bench.experiments.extremes import RECORD_FILE
+from ...bench.experiments.specs import RECORD_FILE
 from ...bench.io.documents import read_json
 from ..writers import pipe_table
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import fmean, stdev, variance
 
 from ...bench.engine.store import RunFolder
-from ...bench.experiments.suite import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, SEEDS_RUN, TRACKED
+from ...bench.experiments.specs import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, SEEDS_RUN, TRACKED
 from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
 from ...bench.rows import ALL, FULL

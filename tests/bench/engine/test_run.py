@@ -2,6 +2,7 @@
 
 import errno
 import importlib
+import os
 import shutil
 import sys
 import time
@@ -9,6 +10,7 @@ import types
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -20,7 +22,7 @@ from headbench.bench.engine import cell as cells
 from headbench.bench.engine import config as runner_config
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.store import RunFolder
-from headbench.bench.errors import HeadbenchError, InputError
+from headbench.bench.errors import HeadbenchError, InputError, reason_of
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
@@ -30,6 +32,75 @@ from headbench.bench.rows import Rows
 from headbench.bench.specs import ReportSpec
 from headbench.reports.runs import RunSet
 from headbench.reports.tables import METHODS_TITLE, SUSPECT_TITLE, build_table
+
+
+def killed_before(number, work):
+    """Work in a process that ends at once before it gives its ``number``-th file its name; how it ended."""
+    process = os.fork()
+    if process == 0:
+        rename, writes = os.replace, []
+
+        def counted(*paths):
+            writes.append(paths)
+            if len(writes) == number:
+                os._exit(9)
+            rename(*paths)
+
+        os.replace = counted
+        try:
+            work()
+            os._exit(0)
+        finally:
+            os._exit(1)
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+
+
+def content(out):
+    return sorted(str(path.relative_to(out)) for path in Path(out).rglob("*"))
+
+
+@pytest.mark.commands
+def test_a_run_killed_before_any_write_continues(config):
+    whole = runner.run(config).rows
+    for number in range(1, 100):
+        again = replace(config, out=f"{config.out}-{number}")
+        ended = killed_before(number, lambda run=again: runner.run(run))
+        if ended == 0:
+            break
+        assert ended == 9
+        assert runner.run(again).rows._table.equals(whole._table)
+        assert content(again.out) == content(config.out)
+    assert 5 < number < 99
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory")]
+)
+def test_out_of_memory_is_an_outcome_of_that_name(error):
+    assert reason_of(error).startswith("out of memory: ")
+    assert reason_of(ValueError("5")) == "ValueError: 5"
+
+
+def test_losses_are_written_as_csv_and_for_tensorboard(config, toy, monkeypatch):
+    original, written = toy.ToyMethod.fit, []
+
+    def fit(self, clip, out, *arguments, **options):
+        original(self, clip, out, *arguments, **options)
+        write_json(out / "training.json", {"losses": [[1, 0.5], [2, 0.25]]})
+
+    class Writer(nullcontext):
+        def __enter__(self):
+            return self
+
+        def add_scalar(self, name, value, step):
+            written.append((name, value, step))
+
+    monkeypatch.setattr(toy.ToyMethod, "fit", fit)
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer))
+    runner.run(config)
+    (losses,) = Path(config.out).glob("*/toy/seed-0/losses.csv")
+    assert losses.read_text() == "iteration,loss\n1,0.5\n2,0.25\n"
+    assert written == [("loss", 0.5, 1), ("loss", 0.25, 2)]
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from headbench.bench.configuration import merge
 from headbench.bench.engine.config import resolve_cells, resolve_method
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.experiments import suite as module
-from headbench.bench.registry import get
 from headbench.datasets.synthetic.panels import default_samples
 from headbench.datasets.synthetic.plan import SyntheticSettings
 from headbench.methods.ours.spec import ADDITIONS, OURS, OURS_PLUS
@@ -54,11 +53,8 @@ def asked(monkeypatch, tmp_path):
             captures.append(given | {"out": out})
             return [Path(out) / "one"]
 
-        found = {
-            get("datasets", "synthetic").implementation: capture,
-            get("reports", "suite").implementation: lambda folder, method: "tables",
-        }
-        monkeypatch.setattr(module, "resolve", found.__getitem__)
+        monkeypatch.setattr("headbench.datasets.synthetic.capture.synthesize", capture)
+        monkeypatch.setattr("headbench.reports.suite.suite.suite_report", lambda folder, method: "tables")
         monkeypatch.setattr(
             module,
             "run",

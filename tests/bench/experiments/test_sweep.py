@@ -7,7 +7,7 @@ import pytest
 
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
-from headbench.bench.experiments import sweep as module
+from headbench.bench.experiments import curve as module
 from headbench.bench.experiments.curve import SweepSettings, sweep_run
 from headbench.bench.io.documents import read_json
 from headbench.bench.rows import ALL, Rows
