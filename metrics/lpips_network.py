@@ -59,24 +59,12 @@ NO_WEIGHTS = "LPIPS: weights missing, see headbench doctor"
 class Lpips:
     """LPIPS with its weights loaded, ready to compare frames.
 
-    Parameters
-    ----------
-    net : str
-        "alex" (the usual choice for evaluation), "squeeze" or "vgg".
-    weights : Path | None
-        File of the backbone, or folder to look in; see the module for the default.
-    device : str
-        Device of the network, which always computes in float32.
-    scaled : bool
-        Whether to scale images to [-1, 1], as the constants expect; False feeds [0, 1].
-    cache_mb : float
-        Maximum memory for cached features of ground-truth images, which the next method reuses, in 10^6
-        bytes.
-
-    Attributes
-    ----------
-    fingerprint : str
-        Hex digest of all weights in use, the same for a full file and one with only the convolutional part.
+    - ``net``: "alex" (the usual choice for evaluation), "squeeze" or "vgg".
+    - ``weights``: file of the backbone, or folder to look in; see the module for the default.
+    - ``device``: device of the network, which always computes in float32.
+    - ``scaled``: whether to scale images to [-1, 1], as the constants expect; False feeds [0, 1].
+    - ``cache_mb``: maximum memory for cached features of ground-truth images, which the next method reuses, in 10^6 bytes.
+    - ``fingerprint``: hex digest of all weights in use, the same for a full file and one with only the convolutional part.
     """
 
     def __init__(

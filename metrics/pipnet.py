@@ -129,12 +129,8 @@ def decode(maps: list[FloatArray], votes: IntArray) -> FloatArray:
     The cell with the highest score of a landmark predicts its position and those of its neighbours. The result is the mean
     of a landmark's own prediction and the ``votes`` for it by others.
 
-    Parameters
-    ----------
-    maps : list[FloatArray]
-        (98, S, S) scores of cells, x and y in the cell, and (980, S, S) x and y of each landmark's neighbours.
-    votes : IntArray
-        (98, V) indices, see `votes`.
+    - ``maps``: (98, S, S) scores of cells, x and y in the cell, and (980, S, S) x and y of each landmark's neighbours.
+    - ``votes``: (98, V) indices, see `votes`.
     """
     scores, x, y, neighbour_x, neighbour_y = maps
     best = scores.reshape(len(scores), -1).argmax(axis=1)

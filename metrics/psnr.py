@@ -36,18 +36,13 @@ class Psnr:
 
     The squared error is summed exactly, in integers. The cap keeps means over frames finite if some frames are
     identical, such as blank ones.
-
-    Attributes
-    ----------
-    per_channel : bool
-        Mean of the PSNRs of red, green and blue, as the training code of GaussianAvatars prints;
-        never below that of all samples together (Jensen).
-    floor : float
-        Added to the mean squared error of images in [0, 1], as in piq.
     """
 
     per_channel: bool = False
+    """Mean of the PSNRs of red, green and blue, as the training code of GaussianAvatars prints; never below that of all samples
+    together (Jensen)."""
     floor: float = 0.0
+    """Added to the mean squared error of images in [0, 1], as in piq."""
 
     def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """PSNR over all pixels of two (H, W, 3) images."""

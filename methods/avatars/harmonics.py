@@ -63,12 +63,8 @@ def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[FloatArr
     A rotated harmonic is a sum of harmonics of its degree; it is found from as many directions as coefficients, exact
     to rounding.
 
-    Parameters
-    ----------
-    dc, rest : Tensor
-        (N, 3) and (N, 3, K - 1) in each splat's own axes, K up to 16.
-    rotation : Tensor
-        (N, 3, 3) from a splat's own axes to the world's.
+    - ``dc``, ``rest``: (N, 3) and (N, 3, K - 1) in each splat's own axes, K up to 16.
+    - ``rotation``: (N, 3, 3) from a splat's own axes to the world's.
     """
     dc, rest, rotation = dc.cpu(), rest.cpu(), rotation.cpu()
     count = coefficient_count(DEGREE)
@@ -88,12 +84,8 @@ def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[FloatArr
 def fit_harmonics(radiance: Callable[[Tensor], Tensor], weights: Tensor, directions: Tensor) -> Harmonics:
     """Weighted least squares for each splat over (M, 3) directions from the splat to the camera.
 
-    Parameters
-    ----------
-    radiance : Callable
-        Maps one direction (3,) to the colours (N, 3) seen from it.
-    weights : Tensor
-        (N, M) weights of the directions, see `visibility`; at least `HIDDEN` is used.
+    - ``radiance``: maps one direction (3,) to the colours (N, 3) seen from it.
+    - ``weights``: (N, M) weights of the directions, see `visibility`; at least `HIDDEN` is used.
     """
     # 3DGS evaluates harmonics along the direction from the camera to the splat.
     basis = sh_basis(-directions, DEGREE)

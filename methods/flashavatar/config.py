@@ -13,47 +13,36 @@ from ..shared.config import HarmonicsTraining, SurfaceSettings, check_at_least_o
 
 @dataclass(frozen=True)
 class FlashAvatarConfig(SurfaceSettings, HarmonicsTraining):
-    """FlashAvatar (CVPR 2024): splats on a mesh, translated, rotated and scaled by a network of the tracked parameters.
-
-    Attributes
-    ----------
-    frequencies : int
-        Number of frequencies of the positional encoding of a splat's point on the neutral mesh: 1, 2, 4, ...
-        radians a metre.
-    layers : int
-        Number of the network's hidden layers.
-    zero_output : bool
-        Initialise the last layer with zeros, so that the network has no effect at first. The authors' program initialises it at
-        random, like the other layers.
-    hyper_gaussians : int
-        Number of latents that the network emits instead of the outputs, which are then conditional means of Gaussians
-        that every splat has over outputs and latents (HyperGaussians, arXiv 2507.02803: 8 in the paper, 32 in the
-        program). They start at zero regardless of ``zero_output``, and have the rate ``network_lr``. 0 disables them.
-    offset_m : float
-        Maximum offset of a splat from its point on the surface along each axis of the head, metres.
-    scale_variant : Literal['official', 'product']
-        "product" multiplies the size of a splat by exp(tanh), which is within a factor of e. "official" does
-        as the authors' program, which multiplies its logarithm by that: a size s in metres becomes s^c, with c
-        from 1/e to e.
-    mouth_weight : float
-        Weight of the Huber loss within the mouth mask, whose cache uses up to another half of ``mesh_cache_mb``. 0
-        disables it, as does a head model without the region "lips".
-    ssim_weight : float
-        Weight of 1 - SSIM, which is added to the loss; 0 as published.
-    """
+    """FlashAvatar (CVPR 2024): splats on a mesh, translated, rotated and scaled by a network of the tracked parameters."""
 
     schedule_length: int = 150_000
     samples: int = 13_500
+
     frequencies: int = 8
+    """Number of frequencies of the positional encoding of a splat's point on the neutral mesh: 1, 2, 4, ... radians a metre."""
     layers: int = 6
+    """Number of the network's hidden layers."""
     hidden: int = 256
+
     zero_output: bool = False
+    """Initialise the last layer with zeros, so that the network has no effect at first. The authors' program initialises it at
+    random, like the other layers."""
     hyper_gaussians: int = 0
+    """Number of latents that the network emits instead of the outputs, which are then conditional means of Gaussians that every
+    splat has over outputs and latents (HyperGaussians, arXiv 2507.02803: 8 in the paper, 32 in the program). They start at zero
+    regardless of ``zero_output``, and have the rate ``network_lr``. 0 disables them."""
     offset_m: float = 1.0
+    """Maximum offset of a splat from its point on the surface along each axis of the head, metres."""
     scale_variant: Literal["official", "product"] = "official"
+    """"product" multiplies the size of a splat by exp(tanh), which is within a factor of e. "official" does as the authors'
+    program, which multiplies its logarithm by that: a size s in metres becomes s^c, with c from 1/e to e."""
     sh_every: int = 500
+
     mouth_weight: float = 40.0
+    """Weight of the Huber loss within the mouth mask, whose cache uses up to another half of ``mesh_cache_mb``. 0 disables it,
+    as does a head model without the region "lips"."""
     ssim_weight: float = 0.0
+    """Weight of 1 - SSIM, which is added to the loss; 0 as published."""
     scale_lr: float = 0.005
     network_lr: float = 1e-4
 

@@ -124,12 +124,8 @@ class GAAvatar(StoredSplatAvatar):
     Files: ``point_cloud.ply`` in GaussianAvatars' layout and ``subject.npz``, or the coded file in place of both, count as
     storage. The folder also has the shared head model and the refined tracking of the training timesteps, which is part of the driving signal.
 
-    Attributes
-    ----------
-    splat_tensors, binding : dict[str, Tensor], Tensor
-        Per-splat tensors by name, and the triangle of each splat.
-    refined : RefinedTracking | None
-        The tracking refined in training; None if it was not refined.
+    - ``splat_tensors``, ``binding``: per-splat tensors by name, and the triangle of each splat.
+    - ``refined``: the tracking refined in training; None if it was not refined.
     """
 
     def __init__(

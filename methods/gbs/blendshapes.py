@@ -32,25 +32,18 @@ def difference_widths(degree: int) -> dict[str, int]:
 
 
 class Entries(NamedTuple):
-    """Splat and expression of each row of the differences.
-
-    Attributes
-    ----------
-    starts : Tensor
-        (N + 1,) int64, the first row of each splat, and the number of rows.
-    owners : Tensor
-        (M,) int64, splat of each row, ascending.
-    weights : Tensor
-        (M,) weights of the rows; 1 if a row holds the difference at coefficient 1.
-    rows : Tensor
-        (M,) int64, 0 to M - 1.
-    """
+    """Splat and expression of each row of the differences."""
 
     starts: Tensor
+    """(N + 1,) int64, the first row of each splat, and the number of rows."""
     owners: Tensor
+    """(M,) int64, splat of each row, ascending."""
     expressions: Tensor
+
     weights: Tensor
+    """(M,) weights of the rows; 1 if a row holds the difference at coefficient 1."""
     rows: Tensor
+    """(M,) int64, 0 to M - 1."""
 
     @classmethod
     def of(cls, counts: Tensor, expressions: Tensor, weights: Tensor) -> Entries:
@@ -113,13 +106,9 @@ def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: Poin
     Each attribute is the neutral one plus its differences, initial and learnt (section 3.2 of the paper); positions
     and rotations then follow the joints (section 3.4).
 
-    Parameters
-    ----------
-    neutral : Mapping[str, Tensor]
-        Means (N, 3) metres, log_scales (N, 3), quats (N, 4), opacities (N,) logits, sh_dc (N, 3) and
-        sh_rest (N, 3, R).
-    differences : Tensor
-        (N, C), learnt and blended, in the columns of `difference_widths`.
+    - ``neutral``: means (N, 3) metres, log_scales (N, 3), quats (N, 4), opacities (N,) logits, sh_dc (N, 3) and sh_rest (N, 3,
+      R).
+    - ``differences``: (N, C), learnt and blended, in the columns of `difference_widths`.
     """
     rest = neutral["sh_rest"]
     by_rest = differences.shape[1] - sum(difference_widths(0).values())
@@ -146,30 +135,19 @@ PARTS = {"linear": 9, "offset": 3, "rotation": 9, "product": 16, "turn": 4, "shi
 
 
 class PointMotions(NamedTuple):
-    """Effect of a pose on splats.
-
-    Attributes
-    ----------
-    linear, offset : Tensor
-        (N, 9) and (N, 3), blended transforms of the joints with eyelids and translation; x -> A x +
-        b.
-    rotation : Tensor
-        (N, 9), the rotation in ``linear``.
-    product : Tensor
-        (N, 16), the matrix of left multiplication by its quaternion.
-    turn : Tensor
-        (N, 4) blended initial differences of rotation, multiplied by the initial quaternion.
-    shift : Tensor
-        (N, 3) initial differences of position, blended, and pose correctives; before the transform,
-        metres.
-    """
+    """Effect of a pose on splats."""
 
     linear: Tensor
     offset: Tensor
+    """(N, 9) and (N, 3), blended transforms of the joints with eyelids and translation; x -> A x + b."""
     rotation: Tensor
+    """(N, 9), the rotation in ``linear``."""
     product: Tensor
+    """(N, 16), the matrix of left multiplication by its quaternion."""
     turn: Tensor
+    """(N, 4) blended initial differences of rotation, multiplied by the initial quaternion."""
     shift: Tensor
+    """(N, 3) initial differences of position, blended, and pose correctives; before the transform, metres."""
 
     @classmethod
     def of(cls, rows: Tensor) -> PointMotions:
@@ -180,22 +158,12 @@ class PointMotions(NamedTuple):
 class Rig:
     """Points on the surface of a subject, moved as FLAME moves it, without expressions beyond the first K.
 
-    Parameters
-    ----------
-    head, shape, static_offset : HeadAsset, FloatArray, FloatArray
-        As for `SubjectMesh`.
-    points : SurfacePoints
-        Points on its neutral mesh.
-    expressions : int
-        K, number of leading expressions that splats follow; the joints follow all.
-
-    Attributes
-    ----------
-    at_points : MeshPoints
-        Interpolates values of the vertices at the points.
-    turns, turned : Tensor
-        (4 F, K) `initial_rotations` of the triangles with points, and (P,) int64 index of each
-        point's triangle in them.
+    - ``head``, ``shape``, ``static_offset``: as for `SubjectMesh`.
+    - ``points``: points on its neutral mesh.
+    - ``expressions``: K, number of leading expressions that splats follow; the joints follow all.
+    - ``at_points``: interpolates values of the vertices at the points.
+    - ``turns``, ``turned``: (4 F, K) `initial_rotations` of the triangles with points, and (P,) int64 index of each point's
+      triangle in them.
     """
 
     def __init__(
@@ -266,12 +234,8 @@ def deformation_gradients(rest: Tensor, moved: Tensor) -> Tensor:
     (Sumner and Popovic, eq. 1 to 3). It takes a point x of the rest triangle's plane to ``Q (x - v0) + v0'``. A
     triangle without area has no such map and gets the identity.
 
-    Parameters
-    ----------
-    rest : Tensor
-        (F, 3, 3) corners, metres.
-    moved : Tensor
-        (..., F, 3, 3) corners.
+    - ``rest``: (F, 3, 3) corners, metres.
+    - ``moved``: (..., F, 3, 3) corners.
     """
     inverse, singular = torch.linalg.inv_ex(_edges(rest))
     maps = _edges(moved) @ inverse
@@ -307,14 +271,9 @@ def initial_rotations(vertices: Tensor, basis: Tensor, faces: Tensor) -> Tensor:
     Multiplied by the initial quaternion of a splat they are the published initial differences of rotation; differences
     are summed over expressions, and the sum is normalised.
 
-    Parameters
-    ----------
-    vertices : Tensor
-        (V, 3) neutral mesh, metres.
-    basis : Tensor
-        (V, 3, K) metres per unit coefficient.
-    faces : Tensor
-        (F, 3) int64.
+    - ``vertices``: (V, 3) neutral mesh, metres.
+    - ``basis``: (V, 3, K) metres per unit coefficient.
+    - ``faces``: (F, 3) int64.
     """
     rest = vertices.to(torch.float64)[faces]
     turns = torch.zeros(len(faces), 4, basis.shape[2], dtype=torch.float64, device=vertices.device)
@@ -335,14 +294,9 @@ def consistency_mask(
     an expression at coefficient 1. Rigid motion in an expression is removed first by aligning the back of the head,
     and the neck never moves.
 
-    Parameters
-    ----------
-    vertices : FloatArray
-        (V, 3) neutral mesh.
-    expressions : int
-        K, number of leading expressions.
-    floor, full : float
-        Displacements where the mask starts and where it is 1, metres.
+    - ``vertices``: (V, 3) neutral mesh.
+    - ``expressions``: K, number of leading expressions.
+    - ``floor``, ``full``: displacements where the mask starts and where it is 1, metres.
     """
     # Teeth have no expressions; the alignment of the scalp would give them some.
     still, neck, teeth = (

@@ -34,64 +34,47 @@ class BlendshapeTraining(DensifiedTraining):
 
 @dataclass(frozen=True)
 class GBSConfig(HarmonicsTraining):
-    """GaussianBlendshapes (SIGGRAPH 2024, arXiv 2404.19398): neutral splats plus differences for expressions.
-
-    Attributes
-    ----------
-    samples, teeth_samples : int
-        Initial number of splats on the head and on each row of teeth; upper limits if
-        ``sample_spacing`` is set.
-    sample_spacing : float
-        Initial distance of neighbouring splats in pixels, on average over the training cameras.
-         0 uses ``samples`` unchanged, as published.
-    expressions : int
-        Number of leading expression coefficients with differences; all, if there are fewer.
-    difference_sh_degree : int
-        Degree up to which the differences change the harmonics.
-    difference_..._lr : float
-        Learning rates of the differences; the same for harmonics of all degrees.
-    position_settles : int
-        Iteration (published scale) at which the learning rate of positions has reached its final
-        value.
-    teeth_densify_gradient : float
-        ``densify_gradient`` for the teeth.
-    mask_floor_mm, mask_full_mm : float
-        Displacement of the surface by one expression, at coefficient 1, up to which its differences
-        are zero and not stored, and from which they have full weight. The published values are a
-        tenth of the largest displacement by FLAME's 50th expression, and the largest by its first.
-    alpha_weight : float
-        Weight of the mean squared difference of alpha and mask; ignored without masks.
-    teeth_weight : float
-        Weight of the penalty on teeth that leave the mouth (`points.MouthCylinder`), the mean over
-        each row, summed.
-    correctives_variant : Literal['paper', 'official']
-        "paper" interpolates the pose correctives of a triangle's corners. "official" sums them as the
-        authors' program does, which makes them three times too strong.
-    lower_teeth_variant : Literal['paper', 'official']
-        "paper" lets the lower teeth follow only the jaw. "official" also lets them follow root and
-        neck by 5.6 % as the authors' program does.
-    """
+    """GaussianBlendshapes (SIGGRAPH 2024, arXiv 2404.19398): neutral splats plus differences for expressions."""
 
     splats: BlendshapeTraining = field(default_factory=BlendshapeTraining)
     capacity: Capacity = field(default_factory=Capacity)
+
     samples: int = 50_000
     teeth_samples: int = 5_000
+    """Initial number of splats on the head and on each row of teeth; upper limits if ``sample_spacing`` is set."""
     sample_spacing: float = 0.0
+    """Initial distance of neighbouring splats in pixels, on average over the training cameras. 0 uses ``samples`` unchanged, as
+    published."""
     expressions: int = 50
+    """Number of leading expression coefficients with differences; all, if there are fewer."""
     difference_sh_degree: int = 3
+    """Degree up to which the differences change the harmonics."""
     difference_position_lr: float = 3.2e-7
     difference_sh_lr: float = 1.25e-3
     difference_scale_lr: float = 5e-4
     difference_rotation_lr: float = 1e-4
     difference_opacity_lr: float = 5e-5
+    """Learning rates of the differences; the same for harmonics of all degrees."""
+
     position_settles: int = 30_000
+    """Iteration (published scale) at which the learning rate of positions has reached its final value."""
     teeth_densify_gradient: float = 2e-4
+    """``densify_gradient`` for the teeth."""
     mask_floor_mm: float = 0.0237277
     mask_full_mm: float = 5.7035
+    """Displacement of the surface by one expression, at coefficient 1, up to which its differences are zero and not stored, and
+    from which they have full weight. The published values are a tenth of the largest displacement by FLAME's 50th expression,
+    and the largest by its first."""
     alpha_weight: float = 10.0
+    """Weight of the mean squared difference of alpha and mask; ignored without masks."""
     teeth_weight: float = 100.0
+    """Weight of the penalty on teeth that leave the mouth (`points.MouthCylinder`), the mean over each row, summed."""
     correctives_variant: Literal["paper", "official"] = "paper"
+    """"paper" interpolates the pose correctives of a triangle's corners. "official" sums them as the authors' program does,
+    which makes them three times too strong."""
     lower_teeth_variant: Literal["paper", "official"] = "paper"
+    """"paper" lets the lower teeth follow only the jaw. "official" also lets them follow root and neck by 5.6 % as the authors'
+    program does."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

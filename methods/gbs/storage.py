@@ -32,25 +32,18 @@ MEMBERS = {
 
 
 class Stored(NamedTuple):
-    """Content of an avatar's file.
-
-    Attributes
-    ----------
-    neutral : dict[str, Tensor]
-        Per-splat tensors by name, see `blendshapes.apply_pose`.
-    points : SurfacePoints
-        Surface point of each splat at the start of training.
-    entries : Entries
-        Rows of the differences; their weights are 1.
-    differences : Tensor
-        (M, C) difference at coefficient 1, in the columns of `blendshapes.difference_widths`.
-    """
+    """Content of an avatar's file."""
 
     neutral: dict[str, Tensor]
+    """Per-splat tensors by name, see `blendshapes.apply_pose`."""
     points: SurfacePoints
+    """Surface point of each splat at the start of training."""
     expressions: int
+
     entries: Entries
+    """Rows of the differences; their weights are 1."""
     differences: Tensor
+    """(M, C) difference at coefficient 1, in the columns of `blendshapes.difference_widths`."""
 
 
 def write_avatar(

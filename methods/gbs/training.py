@@ -42,19 +42,13 @@ small, so that gradients of the table do not become as small as Adam's epsilon."
 
 
 class StartingPoints(NamedTuple):
-    """Initial positions of the splats.
-
-    Attributes
-    ----------
-    points, spacing : SurfacePoints, np.ndarray
-        N points, and the distances to their neighbours, metres.
-    part : np.ndarray
-        (N,) part of each point, ascending: 0 for the head, then a number for each row of teeth.
-    """
+    """Initial positions of the splats."""
 
     points: SurfacePoints
     spacing: np.ndarray
+    """N points, and the distances to their neighbours, metres."""
     part: np.ndarray
+    """(N,) part of each point, ascending: 0 for the head, then a number for each row of teeth."""
 
 
 class GBSTraining(SplatTrainer):
@@ -62,10 +56,7 @@ class GBSTraining(SplatTrainer):
 
     Differences are in one table with a row for each splat and expression whose consistency mask is not zero.
 
-    Attributes
-    ----------
-    points, entries : SurfacePoints, Entries
-        The surface point of each splat at the start, and the differences of the splats.
+    ``points``, ``entries``: the surface point of each splat at the start, and the differences of the splats.
     """
 
     def __init__(

@@ -42,10 +42,7 @@ class GHAAvatar:
     Files: ``avatar.safetensors`` and ``subject.npz``, or the coded file in place of both, count as storage. The folder also has the shared head model and
     the corrected head poses of the training timesteps, which are part of the driving signal.
 
-    Parameters
-    ----------
-    driver : Driver
-        Always on the CPU, regardless of the tensors' device, because its work is small.
+    ``driver``: always on the CPU, regardless of the tensors' device, because its work is small.
     """
 
     def __init__(

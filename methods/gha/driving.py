@@ -71,17 +71,10 @@ class Driver:
     The canonical frame has the axes of the unposed head, its origin at the centre of the neutral landmarks, and a
     unit of ``unit`` metres: x_world = R (unit x) + T.
 
-    Parameters
-    ----------
-    shape, static_offset : FloatArray
-        (S,) identity and (V, 3) metres.
-    expression_scale : Tensor | None
-        (E,) divisor of the expression code; None for ones.
-    origin : FloatArray
-        (3,) origin of the canonical frame in the unposed head, metres.
-    center : FloatArray | None
-        (3,) metres, the origin of translations in `HeadMotion.code`, see `scene_center`; None for the
-        world's origin.
+    - ``shape``, ``static_offset``: (S,) identity and (V, 3) metres.
+    - ``expression_scale``: (E,) divisor of the expression code; None for ones.
+    - ``origin``: (3,) origin of the canonical frame in the unposed head, metres.
+    - ``center``: (3,) metres, the origin of translations in `HeadMotion.code`, see `scene_center`; None for the world's origin.
     """
 
     def __init__(

@@ -174,19 +174,15 @@ class SuperResolution:
     """Blocks of two 3x3 convolutions, each normalised over the image and rectified; a 1x1 convolution; a sigmoid.
 
     The first block works at the size of the features, each further one at twice the previous size.
-
-    Attributes
-    ----------
-    widths : tuple[int, ...]
-        Channels of the blocks.
-    residual : bool
-        Whether to add to the splatted colours, enlarged bilinearly and weighted by their alpha, instead of replacing
-        them; there is no sigmoid then, and the initial output is zero.
     """
 
     channels: int
+
     widths: tuple[int, ...]
+    """Channels of the blocks."""
     residual: bool = False
+    """Whether to add to the splatted colours, enlarged bilinearly and weighted by their alpha, instead of replacing them; there
+    is no sigmoid then, and the initial output is zero."""
 
     @property
     def upscale(self) -> int:
@@ -295,18 +291,11 @@ def posed(
 ) -> tuple[Tensor, ...]:
     """(N, 3) means, (N, 4) quaternions of any length, (N, 3) scales and (N,) opacities of a pose, in the world.
 
-    Parameters
-    ----------
-    rotation, translation : Tensor
-        (3, 3) and (3,), the motion of the canonical frame.
-    turn : Tensor
-        (4, 4), matrix of multiplication by the rotation's quaternion.
-    points, moves : Tensor
-        (N, 3) canonical points, and displacements before their factor.
-    log_scales, quats, opacities : Tensor
-        (N, 3), (N, 4) and (N,) logits, canonical.
-    changes : Tensor
-        (N, 8) changes of these by the networks, before their factor.
+    - ``rotation``, ``translation``: (3, 3) and (3,), the motion of the canonical frame.
+    - ``turn``: (4, 4), matrix of multiplication by the rotation's quaternion.
+    - ``points``, ``moves``: (N, 3) canonical points, and displacements before their factor.
+    - ``log_scales``, ``quats``, ``opacities``: (N, 3), (N, 4) and (N,) logits, canonical.
+    - ``changes``: (N, 8) changes of these by the networks, before their factor.
     """
     unit = config.unit
     scale, quat, faint = (config.attribute_scale * changes).split(list(ATTRIBUTES), dim=1)

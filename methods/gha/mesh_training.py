@@ -44,10 +44,7 @@ NEAR, FAR = 0.1, 0.3
 class MeshTraining(OptimiserState):
     """A `Trainable`; one iteration uses several views of one timestep.
 
-    Parameters
-    ----------
-    fitted : bool
-        Whether to fit the initial surface to the sphere or the tracked mesh; False for a resumed run.
+    ``fitted``: whether to fit the initial surface to the sphere or the tracked mesh; False for a resumed run.
     """
 
     def __init__(self, scene: TrainingScene, head: MeshHead, *, fitted: bool):

@@ -42,10 +42,7 @@ from .spec import GHA as SPEC
 class GHA(TrainedMethod[GHAConfig, GHAAvatar]):
     """See the module docstring.
 
-    Parameters
-    ----------
-    clock : Callable
-        Clock in seconds with any origin, for budgets in seconds.
+    ``clock``: clock in seconds with any origin, for budgets in seconds.
     """
 
     name, version = SPEC.name, SPEC.version

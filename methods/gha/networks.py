@@ -32,30 +32,21 @@ class Weights(Protocol):
 
 @dataclass(frozen=True)
 class Mlp:
-    """An MLP with an input skip connection at layer ``len(widths) // 2``, concatenated after the hidden values.
-
-    Attributes
-    ----------
-    name : str
-        Prefix of its tensors, ``NAME.weight_K`` (out, in) and ``NAME.bias_K`` (out,).
-    point_inputs, condition_inputs : int
-        Sizes of the two parts of the input, in this order.
-    hidden, outputs : tuple[int, ...], int
-        Widths of the layers.
-    zero_condition_weights : bool
-        Whether the condition's weights are initially zero. Conditions that do not occur in training then have no
-        effect, instead of a random one.
-    zero_initialised : bool
-        Whether the last layer is initially zero.
-    """
+    """An MLP with an input skip connection at layer ``len(widths) // 2``, concatenated after the hidden values."""
 
     name: str
+    """Prefix of its tensors, ``NAME.weight_K`` (out, in) and ``NAME.bias_K`` (out,)."""
     point_inputs: int
     condition_inputs: int
+    """Sizes of the two parts of the input, in this order."""
     hidden: tuple[int, ...]
     outputs: int
+    """Widths of the layers."""
     zero_condition_weights: bool = False
+    """Whether the condition's weights are initially zero. Conditions that do not occur in training then have no effect, instead
+    of a random one."""
     zero_initialised: bool = False
+    """Whether the last layer is initially zero."""
 
     @property
     def widths(self) -> tuple[int, ...]:

@@ -210,13 +210,9 @@ class RayColors(NamedTuple):
 class Inference:
     """A trained field in a space, prepared for rendering.
 
-    Parameters
-    ----------
-    mouth : Tensor
-        (F,) bool, as in `render_rays`.
-    backend : str
-        "reference" is `render_rays`; "auto" uses the kernel for parameters in float32 on the CPU. A
-        value of the kernel's ``instruction_sets()`` selects the kernel with that instruction set.
+    - ``mouth``: (F,) bool, as in `render_rays`.
+    - ``backend``: "reference" is `render_rays`; "auto" uses the kernel for parameters in float32 on the CPU. A value of the
+      kernel's ``instruction_sets()`` selects the kernel with that instruction set.
     """
 
     def __init__(

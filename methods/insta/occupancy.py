@@ -68,13 +68,8 @@ class Occupancy:
     ) -> None:
         """Replace values by the maximum of the decayed value and the density at a random point of the cell.
 
-        Parameters
-        ----------
-        condition : Tensor
-            (K,) coefficients for the evaluation of cells of the mouth.
-        whole : bool
-            Whether to refresh all cells; otherwise a random quarter of all and of the occupied
-            ones.
+        - ``condition``: (K,) coefficients for the evaluation of cells of the mouth.
+        - ``whole``: whether to refresh all cells; otherwise a random quarter of all and of the occupied ones.
         """
         generator = numpy_generator(seed, "occupancy", iteration)
         chosen = np.arange(len(self.candidates))

@@ -124,16 +124,10 @@ def composite(
 
     Optical depths are summed in float64, since those of a ray are differences of a sum over all rays.
 
-    Parameters
-    ----------
-    thickness : Tensor
-        (N,) density times the length of each sample; samples ordered by ray, then by distance.
-    values, distances : Tensor
-        (N, C) and (N,).
-    rays : Tensor
-        (N,) int64, ascending, with repetitions.
-    entering : Tensor
-        (R,) transmittance in front of the first of these samples.
+    - ``thickness``: (N,) density times the length of each sample; samples ordered by ray, then by distance.
+    - ``values``, ``distances``: (N, C) and (N,).
+    - ``rays``: (N,) int64, ascending, with repetitions.
+    - ``entering``: (R,) transmittance in front of the first of these samples.
     """
     count = len(entering)
     depth = thickness.double()

@@ -60,46 +60,34 @@ print("headbench-devices", 0 if driver.cuInit(0) or driver.cuDeviceGetCount(ctyp
 
 @dataclass(frozen=True)
 class Repository:
-    """Description of an official repository.
-
-    Attributes
-    ----------
-    commit : str
-        The commit that its adapter was written for.
-    scripts : tuple[str, ...]
-        Files that identify its checkout.
-    modules : tuple[str, ...]
-        Modules that its interpreter must be able to import, if it has one.
-    trial : str
-        A statement that its interpreter must execute, or "", and the remedy if it fails.
-    downloads : Mapping[str, str]
-        Files that the authors distribute separately and expect in the checkout, with their sources.
-    """
+    """Description of an official repository."""
 
     url: str
+
     commit: str
+    """The commit that its adapter was written for."""
     scripts: tuple[str, ...]
+    """Files that identify its checkout."""
     modules: tuple[str, ...]
+    """Modules that its interpreter must be able to import, if it has one."""
     trial: str = ""
+    """A statement that its interpreter must execute, or "", and the remedy if it fails."""
     trial_remedy: str = ""
+
     downloads: Mapping[str, str] = field(default_factory=dict)
+    """Files that the authors distribute separately and expect in the checkout, with their sources."""
 
 
 @dataclass(frozen=True)
 class Checkout:
-    """A validated checkout.
-
-    Attributes
-    ----------
-    python : tuple[str, ...]
-        Command of the interpreter, or of the program if the code is a program.
-    record : dict[str, Any]
-        Commit, modified files and versions, for the avatar's record.
-    """
+    """A validated checkout."""
 
     folder: Path
+
     python: tuple[str, ...]
+    """Command of the interpreter, or of the program if the code is a program."""
     record: dict[str, Any]
+    """Commit, modified files and versions, for the avatar's record."""
 
     def constant(self, file: str, pattern: str, what: str) -> str:
         """First group of ``pattern`` in a source file. Raises `InputError` without a match."""

@@ -16,38 +16,27 @@ def option_words(options: Mapping[str, Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class OfficialConfig:
-    """Location of the authors' code, and how to run it.
-
-    Attributes
-    ----------
-    checkout : str
-        Folder of a checkout of the authors' repository. It is read, never written.
-    python : str
-        Command that starts the interpreter for their code: a path, or words such as ``conda run
-        --no-capture-output -n ga python`` or ``apptainer exec --nv ga.sif python``. A container must
-        see the checkout and the run folder under the same paths.
-    commit : str
-        Expected commit of the checkout, by at least its first seven digits; "" accepts any.
-    arguments : tuple[str, ...]
-        Appended to their training command.
-    device : Literal['cuda', 'cpu-shim']
-        Device of their code. It supports only "cuda"; "cpu-shim" replaces its rasteriser by the CPU renderer of this
-        package and other CUDA code by stand-ins (`shim.cpu`), with headbench's interpreter unless ``python`` names
-        another one with headbench. Rows are then labelled "(cpu-shim)" and are not results of the original.
-    order : Literal['published', 'native']
-        Order of the training images: as their code draws them, or as the native method does with the
-        same seed, so that both use the same image in each iteration.
-    time_limit_hours : float | None
-        Time after which one of their programs is ended and its cell fails; None for no limit.
-    """
+    """Location of the authors' code, and how to run it."""
 
     checkout: str = ""
+    """Folder of a checkout of the authors' repository. It is read, never written."""
     python: str = ""
+    """Command that starts the interpreter for their code: a path, or words such as ``conda run --no-capture-output -n ga
+    python`` or ``apptainer exec --nv ga.sif python``. A container must see the checkout and the run folder under the same
+    paths."""
     commit: str = ""
+    """Expected commit of the checkout, by at least its first seven digits; "" accepts any."""
     arguments: tuple[str, ...] = ()
+    """Appended to their training command."""
     device: Literal["cuda", "cpu-shim"] = "cuda"
+    """Device of their code. It supports only "cuda"; "cpu-shim" replaces its rasteriser by the CPU renderer of this package and
+    other CUDA code by stand-ins (`shim.cpu`), with headbench's interpreter unless ``python`` names another one with headbench.
+    Rows are then labelled "(cpu-shim)" and are not results of the original."""
     order: Literal["published", "native"] = "published"
+    """Order of the training images: as their code draws them, or as the native method does with the same seed, so that both use
+    the same image in each iteration."""
     time_limit_hours: float | None = None
+    """Time after which one of their programs is ended and its cell fails; None for no limit."""
 
     places: ClassVar[tuple[str, ...]] = ("checkout", "python", "time_limit_hours")
 
@@ -87,15 +76,12 @@ class GHAOfficialConfig(OfficialConfig):
     """Gaussian Head Avatar by its authors' code; the default commit is the one that the adapter was written for.
 
     Their scripts take only a configuration file, which is written here, so ``arguments`` must be empty.
-
-    Attributes
-    ----------
-    mesh_fraction : float
-        Fraction of the iterations for the mesh head; their scripts are stopped manually.
     """
 
     commit: str = "d006861f117e1a74174c29631383386ad876922c"
+
     mesh_fraction: float = 0.05
+    """Fraction of the iterations for the mesh head; their scripts are stopped manually."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -110,20 +96,15 @@ class INSTAOfficialConfig(OfficialConfig):
     """INSTA by its authors' code; the default commit is the one that the adapter was written for.
 
     Their code is a compiled program, so ``python`` must be empty.
-
-    Attributes
-    ----------
-    program : str
-        The built program: a file, in the checkout unless its path is absolute, or words that start
-        it, such as ``apptainer exec --nv insta.sif /path/INSTA/build/rta``.
-    images_on_gpu : int
-        Number of training images in the GPU's memory; if there are more, their code loads others
-        every 1,500 iterations.
     """
 
     commit: str = "9c17968ed719f487025577f0fc477749134639c6"
+
     program: str = "build/rta"
+    """The built program: a file, in the checkout unless its path is absolute, or words that start it, such as ``apptainer exec
+    --nv insta.sif /path/INSTA/build/rta``."""
     images_on_gpu: int = 1700
+    """Number of training images in the GPU's memory; if there are more, their code loads others every 1,500 iterations."""
 
     places: ClassVar[tuple[str, ...]] = (*OfficialConfig.places, "program")
 
@@ -149,23 +130,17 @@ SET_ENTRIES = (
 
 @dataclass(frozen=True)
 class RGBAvatarOfficialConfig(OfficialConfig):
-    """RGBAvatar by its authors' code; the default commit is the one that the adapter was written for.
-
-    Attributes
-    ----------
-    samples : int
-        With ``device=cpu-shim``, number of splats, about, on a head of another topology than FLAME's: they are those of the
-        native method with this setting. On FLAME's topology the authors' chart of 256 x 256 texels is used.
-    motion : Literal['neck', 'root']
-        "neck": the motion of the head is moved into the neck joint, as published. "root": it stays that of the whole head.
-    values : tuple[str, ...]
-        Other values for entries of their configuration, as ``NAME=VALUE``.
-    """
+    """RGBAvatar by its authors' code; the default commit is the one that the adapter was written for."""
 
     commit: str = "54a960cd947d236a65f43e0c4b13ce54631a2290"
+
     samples: int = 60_000
+    """With ``device=cpu-shim``, number of splats, about, on a head of another topology than FLAME's: they are those of the
+    native method with this setting. On FLAME's topology the authors' chart of 256 x 256 texels is used."""
     motion: Literal["neck", "root"] = "neck"
+    """"neck": the motion of the head is moved into the neck joint, as published. "root": it stays that of the whole head."""
     values: tuple[str, ...] = ()
+    """Other values for entries of their configuration, as ``NAME=VALUE``."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -178,26 +153,20 @@ class RGBAvatarOfficialConfig(OfficialConfig):
 
 @dataclass(frozen=True)
 class FlashAvatarOfficialConfig(OfficialConfig):
-    """FlashAvatar by its authors' code; the default commit is the one that the adapter was written for.
-
-    Attributes
-    ----------
-    samples : int
-        With ``device=cpu-shim``, number of splats, about, on a head of another topology than FLAME's: they are those of the
-        native method with this setting. On FLAME's topology the authors' chart of 128 x 128 texels is used.
-    masks : Literal['parts', 'native']
-        "parts": masks of head with neck and of the visible mouth, in place of those of the authors' network. "native": nothing that
-        a mask of the capture covers is left out, and the mouth is that of the native method, so that both have the same loss.
-    start : Literal['published', 'native']
-        "native": the network starts as that of the native method with this seed, and sizes with the distances on the
-        neutral mesh, as there. "published": a network drawn by the program, and distances in the first frame drawn, where this network has
-        already moved the splats.
-    """
+    """FlashAvatar by its authors' code; the default commit is the one that the adapter was written for."""
 
     commit: str = "2d4cb25ca9166b795c03692aec12114d595eff15"
+
     samples: int = 13_500
+    """With ``device=cpu-shim``, number of splats, about, on a head of another topology than FLAME's: they are those of the
+    native method with this setting. On FLAME's topology the authors' chart of 128 x 128 texels is used."""
     masks: Literal["parts", "native"] = "parts"
+    """"parts": masks of head with neck and of the visible mouth, in place of those of the authors' network. "native": nothing
+    that a mask of the capture covers is left out, and the mouth is that of the native method, so that both have the same loss."""
     start: Literal["published", "native"] = "published"
+    """"native": the network starts as that of the native method with this seed, and sizes with the distances on the neutral
+    mesh, as there. "published": a network drawn by the program, and distances in the first frame drawn, where this network has
+    already moved the splats."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -21,25 +21,17 @@ Config = TypeVar("Config", bound=OfficialConfig)
 
 @dataclass(frozen=True)
 class RenderCall:
-    """One call of the authors' renderer.
-
-    Attributes
-    ----------
-    command : list[str]
-        The command, run in the program's working directory.
-    numbers : list[int]
-        Numbers of its frames in the list, in the order in which it renders them.
-    renders : str
-        Folder of its renders ``00000.png`` and following.
-    cameras : list[str]
-        A JSON of the listed cameras, and the one that the program writes beside its renders, which must agree; empty
-        if it writes none.
-    """
+    """One call of the authors' renderer."""
 
     command: list[str]
+    """The command, run in the program's working directory."""
     numbers: list[int]
+    """Numbers of its frames in the list, in the order in which it renders them."""
     renders: str
+    """Folder of its renders ``00000.png`` and following."""
     cameras: list[str] = field(default_factory=list)
+    """A JSON of the listed cameras, and the one that the program writes beside its renders, which must agree; empty if it
+    writes none."""
 
 
 class PartsMethod(OfficialMethod[Config]):

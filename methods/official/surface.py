@@ -16,25 +16,17 @@ from ..shared.subject_mesh import pose_key
 
 @dataclass(frozen=True, eq=False)
 class VisibleSurface:
-    """The surface in P covered pixels of a frame.
-
-    Attributes
-    ----------
-    rows, columns : IntArray
-        (P,) the pixels.
-    triangles : IntArray
-        (P,) first triangle of the head on the ray of each; -1 for pixels beside the mesh.
-    depths : FloatArray
-        (P,) metres along the camera's axis; not defined for pixels beside the mesh.
-    vertices : FloatArray
-        (V, 3) the posed mesh in the head's frame, metres.
-    """
+    """The surface in P covered pixels of a frame."""
 
     rows: IntArray
     columns: IntArray
+    """(P,) the pixels."""
     triangles: IntArray
+    """(P,) first triangle of the head on the ray of each; -1 for pixels beside the mesh."""
     depths: FloatArray
+    """(P,) metres along the camera's axis; not defined for pixels beside the mesh."""
     vertices: FloatArray
+    """(V, 3) the posed mesh in the head's frame, metres."""
 
     @property
     def hit(self) -> np.ndarray:

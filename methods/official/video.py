@@ -154,19 +154,14 @@ def frame_parts(**parts: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.nda
 
 @dataclass(frozen=True, eq=False)
 class FlameSubject:
-    """A head model with FLAME's vertices and one identity, for loaders of tracked videos.
-
-    Attributes
-    ----------
-    official : OfficialHead
-        The model without teeth.
-    posed : PosedSubject
-        The clip's own, with teeth if it has them.
-    """
+    """A head model with FLAME's vertices and one identity, for loaders of tracked videos."""
 
     official: OfficialHead
+    """The model without teeth."""
     identity: Subject
+
     posed: PosedSubject
+    """The clip's own, with teeth if it has them."""
 
     @classmethod
     def of(cls, head: HeadAsset, subject: Subject, vertices: int, file: Path) -> FlameSubject:

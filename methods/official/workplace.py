@@ -29,18 +29,14 @@ Patch = tuple[str, str, str]
 class Workplace:
     """Folders of one call of the authors' program.
 
-    Attributes
-    ----------
-    checkout : Checkout
-        The authors' code, which is not modified.
-    input : Path
-        The capture in the repository's own format.
-    program : Path
-        The program's working directory, with the files that it expects.
+    - ``input``: the capture in the repository's own format.
+    - ``program``: the program's working directory, with the files that it expects.
     """
 
     root: Path
+
     checkout: Checkout
+    """The authors' code, which is not modified."""
 
     @classmethod
     def at(cls, root: Path, checkout: Checkout) -> Workplace:

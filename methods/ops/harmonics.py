@@ -62,10 +62,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 def initial_coefficients(count: int, degree: int, generator: torch.Generator) -> dict[str, Tensor]:
     """Coefficients to start training from, as 3DGS stores them: nearly zero at degree 0, zero above.
 
-    Returns
-    -------
-    dict[str, Tensor]
-        ``sh_dc`` (N, 3) and ``sh_rest`` (N, 3, K - 1), K the `coefficient_count` of ``degree``.
+    Returns ``sh_dc`` (N, 3) and ``sh_rest`` (N, 3, K - 1), K the `coefficient_count` of ``degree``.
     """
     dc = torch.rand(count, 3, generator=generator) / 255
     return {"sh_dc": dc, "sh_rest": torch.zeros(count, 3, coefficient_count(degree) - 1)}
@@ -75,12 +72,8 @@ def initial_coefficients(count: int, degree: int, generator: torch.Generator) ->
 def harmonic_colors(dc: Tensor, rest: Tensor, vectors: Tensor, degree: int) -> Tensor:
     """Colours (N, 3) >= 0 seen along vectors from the camera to the splats, of any length: relu(0.5 + SH).
 
-    Parameters
-    ----------
-    dc : Tensor
-        (N, 3) coefficient of degree 0.
-    rest : Tensor
-        (N, 3, K - 1) coefficients of higher degrees by channel; those above ``degree`` are not used.
+    - ``dc``: (N, 3) coefficient of degree 0.
+    - ``rest``: (N, 3, K - 1) coefficients of higher degrees by channel; those above ``degree`` are not used.
     """
     if degree == 0:
         return torch.relu(0.5 + C0 * dc)

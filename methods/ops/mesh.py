@@ -21,24 +21,16 @@ NORMAL = 1
 
 
 class TriangleFrames(NamedTuple):
-    """Frame of each triangle.
-
-    Attributes
-    ----------
-    rotation : Tensor
-        (F, 3, 3); columns are an edge, the normal, and an in-plane axis away from the third vertex.
-    center : Tensor
-        (F, 3) centroid, metres.
-    size : Tensor
-        (F,) mean of base and height, metres.
-    quaternion : Tensor
-        (F, 4) quaternion of ``rotation``, real part first.
-    """
+    """Frame of each triangle."""
 
     rotation: Tensor
+    """(F, 3, 3); columns are an edge, the normal, and an in-plane axis away from the third vertex."""
     center: Tensor
+    """(F, 3) centroid, metres."""
     size: Tensor
+    """(F,) mean of base and height, metres."""
     quaternion: Tensor
+    """(F, 4) quaternion of ``rotation``, real part first."""
 
 
 @Operation
@@ -48,12 +40,8 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
     a0 = unit(v1 - v0), a1 = unit(a0 x (v2 - v0)), a2 = -unit(a1 x a0), R = [a0 a1 a2];
     size = (|v1 - v0| + |a2 . (v2 - v0)|) / 2. A rotation of the mesh rotates only R.
 
-    Parameters
-    ----------
-    vertices : Tensor
-        (V, 3).
-    faces : Tensor
-        (F, 3) int64.
+    - ``vertices``: (V, 3).
+    - ``faces``: (F, 3) int64.
     """
     # Separate coordinates of (3, F) are several times faster on the CPU than rows of three.
     corners = vertices.t().contiguous().index_select(1, faces.t().reshape(-1)).view(3, 3, -1)
@@ -124,12 +112,8 @@ def chart_axes(corners: Tensor, uv_edges: Tensor) -> Tensor:
 
     Each has unit length, but tangent and bitangent are in general not orthogonal (``face_tbn.cu`` of the authors' program of RGBAvatar).
 
-    Parameters
-    ----------
-    corners : Tensor
-        (F, 3, 3) positions of the corners (v0, v1, v2), metres.
-    uv_edges : Tensor
-        (F, 2, 2) texture coordinates of v1 and v2 minus those of v0, as rows; not singular.
+    - ``corners``: (F, 3, 3) positions of the corners (v0, v1, v2), metres.
+    - ``uv_edges``: (F, 2, 2) texture coordinates of v1 and v2 minus those of v0, as rows; not singular.
     """
     edges = corners[:, 1:] - corners[:, :1]
     along = torch.linalg.solve(uv_edges, edges)

@@ -44,10 +44,7 @@ def mean_ssim(image: Tensor, truth: Tensor) -> Tensor:
     Wang et al. 2004, eq. 13 with population moments. This is not an evaluation metric: the zero padding lowers values
     at borders.
 
-    Parameters
-    ----------
-    image, truth : Tensor
-        (3, H, W) in [0, 1].
+    ``image``, ``truth``: (3, H, W) in [0, 1].
     """
     blurred = blur(torch.cat([image, truth, image * image + truth * truth, image * truth]))
     mean_x, mean_y, squares, products = blurred.split(len(image))

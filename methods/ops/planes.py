@@ -20,14 +20,9 @@ from .splats import directions_to
 def sum_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     """(N, C) sums over k of ``weights[:, k] * table[rows[:, k]]``; differentiable in table and weights.
 
-    Parameters
-    ----------
-    table : Tensor
-        (T, C).
-    rows : Tensor
-        (N, K) int64.
-    weights : Tensor
-        (N, K), of the table's dtype.
+    - ``table``: (T, C).
+    - ``rows``: (N, K) int64.
+    - ``weights``: (N, K), of the table's dtype.
     """
     return embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
@@ -97,21 +92,15 @@ class Bounds(NamedTuple):
 
 
 class ColorNetwork(NamedTuple):
-    """Colour as a function of position and direction.
-
-    Attributes
-    ----------
-    xy, xz, yz : Tensor
-        (R * R, C_k) planes.
-    first, last : Tensor
-        (H, C + 27) and (3, H) weights, C the sum of the C_k.
-    """
+    """Colour as a function of position and direction."""
 
     xy: Tensor
     xz: Tensor
     yz: Tensor
+    """(R * R, C_k) planes."""
     first: Tensor
     last: Tensor
+    """(H, C + 27) and (3, H) weights, C the sum of the C_k."""
 
 
 def triplane_features(planes: Sequence[Tensor], box: Bounds, positions: Tensor) -> tuple[Tensor, ...]:
@@ -128,10 +117,7 @@ def triplane_features(planes: Sequence[Tensor], box: Bounds, positions: Tensor) 
 def plane_colors(positions: Tensor, directions: Tensor, box: Bounds, network: ColorNetwork) -> Tensor:
     """Colours (N, 3) >= 0: [features, encoded direction] -> hidden -> ReLU -> relu(0.5 + C0 * out), no bias.
 
-    Parameters
-    ----------
-    positions, directions : Tensor
-        (N, 3), and (N, 3) unit vectors to the camera.
+    ``positions``, ``directions``: (N, 3), and (N, 3) unit vectors to the camera.
     """
     features = triplane_features(network[:3], box, positions)
     inputs = torch.cat([*features, encode(directions)], dim=1)
@@ -205,10 +191,7 @@ class OffsetLayers(NamedTuple):
 def line_offsets(positions: Tensor, box: Bounds, table: Tensor, layers: OffsetLayers) -> Tensor:
     """(N, D) offsets at (N, 3) positions, 0 outside the box; no gradient for positions and box.
 
-    Parameters
-    ----------
-    table : Tensor
-        (3 L, H) contribution of each sample of the lines to the first layer.
+    ``table``: (3 L, H) contribution of each sample of the lines to the first layer.
     """
     # Computed outside as well, since selecting the points inside would make the host wait for a GPU.
     position = line_position(box.unit(positions.detach()), len(table) // AXES)
@@ -246,12 +229,8 @@ Shader = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 def shader(from_position: Tensor, of_direction: Tensor, last: Tensor) -> Shader:
     """`plane_colors` of constant positions for any number of views.
 
-    Parameters
-    ----------
-    from_position : Tensor
-        (N, H) contribution of the planes to the hidden layer.
-    of_direction, last : Tensor
-        (27, H) and (3, H) weights of the encoded direction and of the hidden layer.
+    - ``from_position``: (N, H) contribution of the planes to the hidden layer.
+    - ``of_direction``, ``last``: (27, H) and (3, H) weights of the encoded direction and of the hidden layer.
     """
 
     def shade(means: Tensor, center: Tensor, turns: Tensor, binding: Tensor) -> Tensor:

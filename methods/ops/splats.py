@@ -58,18 +58,11 @@ def to_world(
 ) -> WorldSplats:
     """Transform local splats to world space: mean' = k R mean + T, scale' = k exp(s), q' = q(R) q/|q|.
 
-    Parameters
-    ----------
-    binding : Tensor
-        (N,) int64, the triangle of each splat.
-    means : Tensor
-        (N, 3) in units of the triangle's size.
-    log_scales : Tensor
-        (N, 3) logarithms in the same unit.
-    quats : Tensor
-        (N, 4), real part first, of any length.
-    activated : Activated | None
-        Activations of ``log_scales`` and ``quats``, if these are constant over frames and no gradient is needed.
+    - ``binding``: (N,) int64, the triangle of each splat.
+    - ``means``: (N, 3) in units of the triangle's size.
+    - ``log_scales``: (N, 3) logarithms in the same unit.
+    - ``quats``: (N, 4), real part first, of any length.
+    - ``activated``: activations of ``log_scales`` and ``quats``, if these are constant over frames and no gradient is needed.
     """
     linear = (frames.size[:, None, None] * frames.rotation).flatten(1)
     # One gather instead of four, and one scatter for its gradient. The quaternion is passed as the matrix of
@@ -120,12 +113,8 @@ class _ToWorld(torch.autograd.Function):
 def points_on(means: Tensor, binding: Tensor, linear: Tensor, center: Tensor) -> Tensor:
     """Positions (N, 3) on a mesh of local means: A mean + c. In the compiled form only ``means`` receive a gradient.
 
-    Parameters
-    ----------
-    binding : Tensor
-        (N,) int64, the triangle of each splat.
-    linear, center : Tensor
-        (F, 9) size times rotation, and (F, 3), by triangle.
+    - ``binding``: (N,) int64, the triangle of each splat.
+    - ``linear``, ``center``: (F, 9) size times rotation, and (F, 3), by triangle.
     """
     return apply_matrices(linear.index_select(0, binding), means) + center.index_select(0, binding)
 
@@ -158,14 +147,9 @@ def directions_to(
     """Unit vectors (N, 3) from world means to the camera, rotated by triangle. In the compiled form only ``means``
     receive a gradient.
 
-    Parameters
-    ----------
-    center : Tensor
-        (3,) position of the camera.
-    turns, binding : Tensor
-        (F, 3, 3) rotations by triangle, and (N,) int64, the triangle of each splat.
-    last : Tensor | None
-        (3, 3) applied to all directions afterwards; None for no rotation.
+    - ``center``: (3,) position of the camera.
+    - ``turns``, ``binding``: (F, 3, 3) rotations by triangle, and (N,) int64, the triangle of each splat.
+    - ``last``: (3, 3) applied to all directions afterwards; None for no rotation.
     """
     directions = normalize(center - means, dim=1)
     rows = turns.reshape(-1, 9).index_select(0, binding)

@@ -230,12 +230,8 @@ def penalty_weights(
     Opacities of splats may change only if the expression moves the centroid of their triangle by more than a
     threshold. The face region and the rest have different thresholds and weights.
 
-    Parameters
-    ----------
-    unposed, canonical : Tensor
-        (V, 3) metres, with and without expression, jaw and eyes.
-    is_face : Tensor
-        (F,) triangles of the face region.
+    - ``unposed``, ``canonical``: (V, 3) metres, with and without expression, jaw and eyes.
+    - ``is_face``: (F,) triangles of the face region.
     """
     millimetres = 1000 * centroid_displacements(unposed, canonical, faces)
     still_face = (millimetres < config.penalty.face_mm).to(millimetres.dtype)

@@ -52,10 +52,7 @@ from .storage import FIELD_FILE, RESIDUAL, StoredField, field_of, splat_columns
 class LineOffsets:
     """Offsets of the splats inside the lines' box; others have none.
 
-    Parameters
-    ----------
-    positions : Tensor
-        (N, 3) canonical positions.
+    ``positions``: (N, 3) canonical positions.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor], positions: Tensor):
@@ -98,21 +95,11 @@ class OursAvatar(StoredSplatAvatar):
     Values that depend only on the canonical position (plane features, positions on the lines) are computed once when
     the avatar is loaded. A folder has the files of a training, or the coded file in place of them.
 
-    Parameters
-    ----------
-    face : Tensor | None
-        (F,) bool, triangles of the face, by which `changes` tells penalised splats from others.
-
-    Attributes
-    ----------
-    subject, field : Subject, StoredField
-        The subject, and the content of its file.
-    neutral : LocalSplats
-        The splats before an expression changes them.
-    line_offsets : LineOffsets | None
-        Offsets given by the lines; None without lines.
-    colors : Shader
-        View-dependent colour of the planes, or of spherical harmonics, see `Shader`.
+    - ``face``: (F,) bool, triangles of the face, by which `changes` tells penalised splats from others.
+    - ``subject``, ``field``: the subject, and the content of its file.
+    - ``neutral``: the splats before an expression changes them.
+    - ``line_offsets``: offsets given by the lines; None without lines.
+    - ``colors``: view-dependent colour of the planes, or of spherical harmonics, see `Shader`.
     """
 
     def __init__(

@@ -29,18 +29,12 @@ MINIMUM_PLANE, MINIMUM_LINE = 8, 4
 
 @dataclass(frozen=True)
 class OursPlan(CapacityPlan):
-    """The sizes of an avatar of "ours".
-
-    Attributes
-    ----------
-    lines : bool
-        Whether anything is dynamic.
-    lines_within : tuple[tuple[float, ...], tuple[float, ...]] | None
-        Corners of the lines' box, metres, if it differs from that of ``lines.bounds``.
-    """
+    """The sizes of an avatar of "ours"."""
 
     lines: bool
+    """Whether anything is dynamic."""
     lines_within: tuple[tuple[float, ...], tuple[float, ...]] | None
+    """Corners of the lines' box, metres, if it differs from that of ``lines.bounds``."""
 
     def apply(self, config: OursConfig) -> OursConfig:  # type: ignore[override]
         """The configuration with the planned sizes in it."""
@@ -63,10 +57,7 @@ class OursPlan(CapacityPlan):
 def plan_capacity(clip: Clip, mesh: SubjectMesh, config: OursConfig) -> OursPlan:
     """Decide the sizes from cameras, poses and pictures of the training frames.
 
-    Parameters
-    ----------
-    config : OursConfig
-        Its sizes are upper limits; those in ``capacity.keep`` are not changed.
+    ``config``: its sizes are upper limits; those in ``capacity.keep`` are not changed.
     """
     planner = _Planner(clip, mesh, config)
     planner.lines()
@@ -214,12 +205,8 @@ def spanning_jaw_bases(
     the same span are equivalent: at most four are needed, and two for a jaw that only opens. A residual r of a unit
     quaternion is a rotation by 2 asin(r), which moves a vertex by 2 r times its lever.
 
-    Returns
-    -------
-    tuple[int, float]
-        Number of bases, at most ``limit``, in the farthest-point order of `jaw_bases`, and metres.
-        None are needed if no training pose moves a vertex by more than the tolerance from the mean
-        jaw rotation.
+    Returns number of bases, at most ``limit``, in the farthest-point order of `jaw_bases`, and metres. None are needed if no
+    training pose moves a vertex by more than the tolerance from the mean jaw rotation.
     """
     candidates = jaw_quaternions(poses)
     mean = candidates.mean(0)

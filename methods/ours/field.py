@@ -42,27 +42,18 @@ FIELDS = {"opacity": "logits", "position": "means", "rotation": "quats", "scale"
 
 
 class LocalSplats(NamedTuple):
-    """Splats in their triangles' frames, before or after changes by an expression.
-
-    Attributes
-    ----------
-    means : Tensor
-        (N, 3) in units of the triangle's size.
-    log_scales : Tensor
-        (N, 3) logarithms in the same unit.
-    quats : Tensor
-        (N, 4), real part first, of any length.
-    logits : Tensor
-        (N,) logits of the opacities.
-    color_change : Tensor | None
-        (N, 3) added to the colours before they are clamped at 0; None for no change.
-    """
+    """Splats in their triangles' frames, before or after changes by an expression."""
 
     means: Tensor
+    """(N, 3) in units of the triangle's size."""
     log_scales: Tensor
+    """(N, 3) logarithms in the same unit."""
     quats: Tensor
+    """(N, 4), real part first, of any length."""
     logits: Tensor
+    """(N,) logits of the opacities."""
     color_change: Tensor | None = None
+    """(N, 3) added to the colours before they are clamped at 0; None for no change."""
 
 
 def offset_width(dynamic: Sequence[Dynamic]) -> int:
@@ -97,12 +88,8 @@ class NamedTensors(Protocol):
 def blend_lines(lines: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
     """Blend once per frame: (2, 3, L, C), expression lines first, then jaw lines.
 
-    Parameters
-    ----------
-    lines : Tensor
-        (E + J, 3, L, C).
-    expression, jaw : Tensor
-        (E,) coefficients and (J,) weights.
+    - ``lines``: (E + J, 3, L, C).
+    - ``expression``, ``jaw``: (E,) coefficients and (J,) weights.
     """
     flat = lines.flatten(1)
     count = len(expression)
@@ -176,21 +163,14 @@ def line_box(vertices: Tensor) -> Bounds:
 
 @dataclass(frozen=True, eq=False)
 class CanonicalFrames:
-    """Triangle frames of the canonical mesh, which map splats and directions to canonical space.
-
-    Attributes
-    ----------
-    linear : Tensor
-        (F, 9) size times rotation.
-    center : Tensor
-        (F, 3).
-    rotation : Tensor
-        (F, 3, 3).
-    """
+    """Triangle frames of the canonical mesh, which map splats and directions to canonical space."""
 
     linear: Tensor
+    """(F, 9) size times rotation."""
     center: Tensor
+    """(F, 3)."""
     rotation: Tensor
+    """(F, 3, 3)."""
 
     @classmethod
     def of(cls, frames: TriangleFrames) -> CanonicalFrames:

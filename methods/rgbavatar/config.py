@@ -23,81 +23,64 @@ OFFICIAL_LEAST = 0.1
 
 @dataclass(frozen=True)
 class RGBAvatarConfig(SurfaceSettings):
-    """RGBAvatar (CVPR 2025): splats on a mesh with a few blendshapes, whose weights are predicted by a small network.
-
-    Attributes
-    ----------
-    initial_scale_mm : float
-        Size of every splat at the start, for 60,000 splats; fewer splats are larger, so that they cover as much.
-    blendshapes : int
-        Number of blendshapes of position, rotation and colour.
-    inputs : tuple[str, ...]
-        Tracked parameters that the weights of the blendshapes depend on, among expression, neck, jaw, eyes,
-        eyelids and translation; those that the head model lacks are left out. The authors' program uses all of
-        them for a video and only the expression for NeRSemble.
-    batch, together : int
-        Images of a step, and how many of them show the same timestep, if it has that many cameras. The published
-        batch draws its images independently, as 1 does.
-    online : bool
-        Train as if the images, sorted by timestep, arrived one after another, and draw mostly the newest
-        (local-global sampling); blendshapes are trained from the start, and every splat is kept. Requires ``together`` = 1.
-    trained_per_arrival : int
-        Images trained on for each that arrives in ``online``: 25 at the published 630 images a second and 25
-        frames a second. After 10 s of video 250 images have arrived in 625 steps of 10.
-    random_background : bool
-        Train on a random background for each image; ignored without masks.
-    ssim_weight : float
-        The loss is ``(1 - w) L1 + w (1 - SSIM)``. The authors' program uses 0 for a video, 0.2 for NeRSemble.
-    join : int
-        Step after which the blendshapes are trained.
-    position_lr, position_lr_final, position_settles : float, float, int
-        Initial and final learning rate of positions in metres, log-linear up to the step ``position_settles``.
-    color_lr : float
-        Learning rate of colours.
-    position_share, rotation_share, color_share : float
-        Learning rates of the blendshapes relative to those of the neutral splats.
-    color_weight : float
-        A splat takes its initial colour from the images of the first step in which its weights over all pixels
-        add up to more than this; 0 disables it.
-    color_every : int
-        Steps between searches for splats without a colour, each of which costs as much as the step.
-    frame_variant : Literal['orthonormal', 'official']
-        Axes of positions and rotations of a splat. "orthonormal": an edge of its triangle, the normal, and their cross product.
-        "official": tangent, bitangent and normal along the texture coordinates, which the head model must have; of unit
-        length and not orthogonal, as in the authors' program.
-    color_init_variant : Literal['paper', 'official']
-        Initial colours. "paper": means over all foreground pixels, set before the step of the optimiser and not changed by it.
-        "official": only pixels in which a splat's weight is above `OFFICIAL_LEAST` count, colours are set after the step with the
-        moments kept, and splats without a colour are removed at the end, as in the authors' program.
-    """
+    """RGBAvatar (CVPR 2025): splats on a mesh with a few blendshapes, whose weights are predicted by a small network."""
 
     schedule_length: int = 5_000
     samples: int = 60_000
+
     initial_scale_mm: float = 0.8
+    """Size of every splat at the start, for 60,000 splats; fewer splats are larger, so that they cover as much."""
     initial_opacity: float = 0.5
+
     blendshapes: int = 20
+    """Number of blendshapes of position, rotation and colour."""
     inputs: tuple[str, ...] = INPUTS
+    """Tracked parameters that the weights of the blendshapes depend on, among expression, neck, jaw, eyes, eyelids and
+    translation; those that the head model lacks are left out. The authors' program uses all of them for a video and only the
+    expression for NeRSemble."""
     batch: int = 10
     together: int = 1
+    """Images of a step, and how many of them show the same timestep, if it has that many cameras. The published batch draws its
+    images independently, as 1 does."""
     online: bool = False
+    """Train as if the images, sorted by timestep, arrived one after another, and draw mostly the newest (local-global
+    sampling); blendshapes are trained from the start, and every splat is kept. Requires ``together`` = 1."""
     trained_per_arrival: int = 25
+    """Images trained on for each that arrives in ``online``: 25 at the published 630 images a second and 25 frames a second.
+    After 10 s of video 250 images have arrived in 625 steps of 10."""
     random_background: bool = True
+    """Train on a random background for each image; ignored without masks."""
     ssim_weight: float = 0.0
+    """The loss is ``(1 - w) L1 + w (1 - SSIM)``. The authors' program uses 0 for a video, 0.2 for NeRSemble."""
     join: int = 300
+    """Step after which the blendshapes are trained."""
     position_lr: float = 8e-4
     position_lr_final: float = 8e-6
     position_settles: int = 3_000
+    """Initial and final learning rate of positions in metres, log-linear up to the step ``position_settles``."""
     opacity_lr: float = 0.25
     scale_lr: float = 0.025
     rotation_lr: float = 0.005
+
     color_lr: float = 0.0125
+    """Learning rate of colours."""
     position_share: float = 0.05
     rotation_share: float = 0.5
     color_share: float = 0.5
+    """Learning rates of the blendshapes relative to those of the neutral splats."""
     color_weight: float = 0.1
+    """A splat takes its initial colour from the images of the first step in which its weights over all pixels add up to more
+    than this; 0 disables it."""
     color_every: int = 1
+    """Steps between searches for splats without a colour, each of which costs as much as the step."""
     frame_variant: Literal["orthonormal", "official"] = "orthonormal"
+    """Axes of positions and rotations of a splat. "orthonormal": an edge of its triangle, the normal, and their cross product.
+    "official": tangent, bitangent and normal along the texture coordinates, which the head model must have; of unit length and
+    not orthogonal, as in the authors' program."""
     color_init_variant: Literal["paper", "official"] = "paper"
+    """Initial colours. "paper": means over all foreground pixels, set before the step of the optimiser and not changed by it.
+    "official": only pixels in which a splat's weight is above `OFFICIAL_LEAST` count, colours are set after the step with the
+    moments kept, and splats without a colour are removed at the end, as in the authors' program."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

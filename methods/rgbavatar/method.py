@@ -46,14 +46,9 @@ class OnlineBatches(Batches):
     `LOCAL`, where newer ones are more probable. The global pool is a uniform sample of `GLOBAL` older images
     (reservoir sampling; Vitter, ACM TOMS 1985, algorithm R).
 
-    Parameters
-    ----------
-    order : Sequence[int]
-        Indices of the images in the order of their arrival.
-    size : int
-        Images of a batch, at most `LOCAL`; fewer before that many have arrived.
-    trained : int
-        Images trained on for each that arrives.
+    - ``order``: indices of the images in the order of their arrival.
+    - ``size``: images of a batch, at most `LOCAL`; fewer before that many have arrived.
+    - ``trained``: images trained on for each that arrives.
     """
 
     def __init__(self, order: Sequence[int], size: int, trained: int, seed: int):
@@ -98,10 +93,7 @@ class OnlineBatches(Batches):
 class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
     """A `Trainable`: neutral splats, grey and of equal size at first, their blendshapes, and the network of the weights.
 
-    Attributes
-    ----------
-    colored : Tensor
-        (N,) bool, splats with a colour initialised from images.
+    ``colored``: (N,) bool, splats with a colour initialised from images.
     """
 
     stored_class = StoredShapes

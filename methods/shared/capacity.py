@@ -39,21 +39,14 @@ class Decision:
 
 @dataclass(frozen=True)
 class CapacityPlan:
-    """The sizes of an avatar, decided from its training data.
-
-    Attributes
-    ----------
-    tolerance : float
-        Tolerance in pixels.
-    pixel : float
-        Size of a pixel on the head, metres, median over training frames.
-    decisions : tuple[Decision, ...]
-        One for each size that "auto" decides.
-    """
+    """The sizes of an avatar, decided from its training data."""
 
     tolerance: float
+    """Tolerance in pixels."""
     pixel: float
+    """Size of a pixel on the head, metres, median over training frames."""
     decisions: tuple[Decision, ...]
+    """One for each size that "auto" decides."""
 
     def apply(self, config: Config) -> Config:
         """The configuration with the planned sizes."""
@@ -86,10 +79,7 @@ def with_sizes(config: Config, sizes: Mapping[str, Any]) -> Config:
 class CapacityPlanner:
     """Data shared by the decisions, and those that methods have in common; each is added to ``decisions``.
 
-    Parameters
-    ----------
-    mesh : SubjectMesh
-        Mesh of the clip's subject, with the clip's head model.
+    ``mesh``: mesh of the clip's subject, with the clip's head model.
     """
 
     def __init__(self, clip: Clip, mesh: SubjectMesh, capacity: Capacity):
@@ -166,10 +156,7 @@ _BLOCK = 64  # timesteps whose displacement fields are in memory at once
 def pixel_footprint(clip: Clip, center: FloatArray) -> float:
     """Size of a pixel on the head, metres: median over training frames of depth divided by focal length.
 
-    Parameters
-    ----------
-    center : FloatArray
-        (3,) centre of the canonical head, metres; each pose's translation is added.
+    ``center``: (3,) centre of the canonical head, metres; each pose's translation is added.
     """
     sizes = []
     for key in clip.splits["train"]:
@@ -185,20 +172,11 @@ def leading_directions(coefficients: FloatArray, basis: FloatArray, tolerance: f
 
     Deviations from the mean over the timesteps count, since a constant expression needs no direction.
 
-    Parameters
-    ----------
-    coefficients : FloatArray
-        (T, E) coefficients of the training timesteps.
-    basis : FloatArray
-        (V, 3, E) metres per unit.
-    tolerance : float
-        Metres.
-
-    Returns
-    -------
-    int
-        The smallest K such that leaving out the directions from K on, or from any later one on,
-        displaces no vertex by more than the tolerance in any timestep.
+    - ``coefficients``: (T, E) coefficients of the training timesteps.
+    - ``basis``: (V, 3, E) metres per unit.
+    - ``tolerance``: Metres.
+    - Returns the smallest K such that leaving out the directions from K on, or from any later one on, displaces no vertex by
+      more than the tolerance in any timestep.
     """
     deviation, columns = _deviation(coefficients), _columns(basis)
     needed = 0

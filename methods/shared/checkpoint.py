@@ -30,13 +30,8 @@ REMEDY = "Delete it to start over."
 def save_checkpoint(path: Path, run: str, state: dict[str, Any]) -> None:
     """Write the state of a run.
 
-    Parameters
-    ----------
-    run : str
-        Digest of everything the run was started with; `load_checkpoint` refuses files with another
-        digest.
-    state : dict[str, Any]
-        Nested dicts, lists and tuples of tensors, numbers and text.
+    - ``run``: digest of everything the run was started with; `load_checkpoint` refuses files with another digest.
+    - ``state``: nested dicts, lists and tuples of tensors, numbers and text.
     """
     tensors: dict[str, Tensor] = {}
     tree = _packed(state, tensors)

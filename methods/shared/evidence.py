@@ -44,17 +44,12 @@ _STEP = 0.02  # radians, of the finite differences by jaw rotation
 
 @dataclass(frozen=True)
 class PictureMotion:
-    """Deviations of expression and jaw from their means at T training timesteps, from tracking and from images.
-
-    Attributes
-    ----------
-    tracked, pictured : FloatArray
-        (T, E + 3) root mean square displacement of the face, pixels, by each expression coefficient and each component of the
-        jaw's rotation.
-    """
+    """Deviations of expression and jaw from their means at T training timesteps, from tracking and from images."""
 
     tracked: FloatArray
     pictured: FloatArray
+    """(T, E + 3) root mean square displacement of the face, pixels, by each expression coefficient and each component of the
+    jaw's rotation."""
 
     def agreement(self, columns: slice) -> float:
         """Agreement of tracked and image-based coefficients, in standard deviations above chance.
@@ -79,10 +74,7 @@ class PictureMotion:
 def picture_motion(clip: Clip, mesh: SubjectMesh, pixel: float) -> PictureMotion | None:
     """Compare tracking and training pictures; None if there are fewer than `LEAST_TIMESTEPS`.
 
-    Parameters
-    ----------
-    pixel : float
-        Size of a pixel on the head, metres.
+    ``pixel``: size of a pixel on the head, metres.
     """
     rows: dict[int, list[FrameKey]] = {}
     for key in sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera)):

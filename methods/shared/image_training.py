@@ -22,15 +22,8 @@ Initial = Mapping[str, tuple[Tensor, float]]
 class ImageTrainer(OptimiserState):
     """A `Trainable` except for its loss. A derived class calls `_optimise` in its initialiser.
 
-    Parameters
-    ----------
-    masks : bool
-        Whether images have a fourth channel, the foreground coverage, if the clip has masks.
-
-    Attributes
-    ----------
-    keys, cameras : Sequence[FrameKey], dict[str, Camera]
-        The training frames, in the order of the sampler's indices, and their cameras by name.
+    - ``masks``: whether images have a fourth channel, the foreground coverage, if the clip has masks.
+    - ``keys``, ``cameras``: the training frames, in the order of the sampler's indices, and their cameras by name.
     """
 
     cost_growth: float = 1.0

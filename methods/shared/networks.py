@@ -64,10 +64,7 @@ def outputs_of(network: Mapping[str, Tensor], sums: Tensor, layers: int) -> Tens
 def initial_network(sizes: Sequence[int], seed: int) -> dict[str, Tensor]:
     """Weights and biases by name, uniform in the inverse root of the layer's inputs, as `torch.nn.Linear` has them.
 
-    Parameters
-    ----------
-    sizes : Sequence[int]
-        Number of inputs, widths of the hidden layers, number of outputs.
+    ``sizes``: number of inputs, widths of the hidden layers, number of outputs.
     """
     generator, tensors = torch_generator(seed, "network"), {}
     for weight, bias, fan_in, fan_out in zip(*layer_names(len(sizes) - 1), sizes, sizes[1:]):

@@ -38,12 +38,8 @@ class Optimiser:
     zeros for new rows. A replaced parameter has no gradient, so it is not changed by the following step, as in the
     published code.
 
-    Parameters
-    ----------
-    betas : tuple[float, float]
-        Decay of the two moments.
-    epsilons : Mapping[str, float]
-        Epsilon by name; `EPS`, that of 3DGS, for all others.
+    - ``betas``: decay of the two moments.
+    - ``epsilons``: epsilon by name; `EPS`, that of 3DGS, for all others.
     """
 
     def __init__(
@@ -145,22 +141,14 @@ class Densifier:
     Per-splat parameters are the optimiser's groups ``names``; "means", "log_scales", "quats" and "opacities"
     (logits) must be among them.
 
-    Parameters
-    ----------
-    binding : Tensor
-        (N,) int64, triangle of each splat.
-    extent : float
-        Size of the scene, metres (`scene_extent`).
-    thresholds : Tensor | None
-        (F,) gradient above which splats are cloned or split, by triangle; None uses
-        ``settings.densify_gradient`` for all.
-    keep_last : bool
-        Whether the last splat of a triangle is never removed.
-    tables : tuple[str, ...]
-        Groups with any number of rows per splat, ordered by splat; splats on one triangle have the same number.
-        Children inherit them.
-    table_rows : Tensor | None
-        (F,) int64, number of rows in the tables for a splat on each triangle.
+    - ``binding``: (N,) int64, triangle of each splat.
+    - ``extent``: size of the scene, metres (`scene_extent`).
+    - ``thresholds``: (F,) gradient above which splats are cloned or split, by triangle; None uses ``settings.densify_gradient``
+      for all.
+    - ``keep_last``: whether the last splat of a triangle is never removed.
+    - ``tables``: groups with any number of rows per splat, ordered by splat; splats on one triangle have the same number.
+      Children inherit them.
+    - ``table_rows``: (F,) int64, number of rows in the tables for a splat on each triangle.
     """
 
     def __init__(
@@ -199,11 +187,7 @@ class Densifier:
     def run(self, iteration: int, schedule: DensifySchedule, face_sizes: Tensor) -> None:
         """Clone, split and prune, then reset the accumulated gradients.
 
-        Parameters
-        ----------
-        face_sizes : Tensor
-            (F,) triangle sizes of the current frame, metres, which convert local scales into
-            world scales.
+        ``face_sizes``: (F,) triangle sizes of the current frame, metres, which convert local scales into world scales.
         """
         gradient = self._gradient_sum / self._views.clamp_min(1)
         if self._thresholds is None:

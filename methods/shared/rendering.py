@@ -25,23 +25,16 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True, eq=False)
 class PosedSplats:
-    """Splats of one pose in the world, as numpy float32.
-
-    Attributes
-    ----------
-    means, quats, scales : FloatArray
-        (N, 3) metres, (N, 4) unit quaternions wxyz, (N, 3) metres.
-    opacities : FloatArray
-        (N,).
-    colors : FloatArray | None
-        (N, 3) as seen from the requested camera; None without a camera.
-    """
+    """Splats of one pose in the world, as numpy float32."""
 
     means: FloatArray
     quats: FloatArray
     scales: FloatArray
+    """(N, 3) metres, (N, 4) unit quaternions wxyz, (N, 3) metres."""
     opacities: FloatArray
+    """(N,)."""
     colors: FloatArray | None
+    """(N, 3) as seen from the requested camera; None without a camera."""
 
 
 class Cutoffs(NamedTuple):
@@ -247,12 +240,8 @@ class LastPose(Generic[Value]):
 class StoredSplatAvatar:
     """Base class of splat avatars.
 
-    Parameters
-    ----------
-    stored : Sequence[Path]
-        Files in the avatar's folder that count towards its size.
-    place : Callable
-        Returns the splats of a pose; calls its second argument with "drive" when the mesh is posed.
+    - ``stored``: files in the avatar's folder that count towards its size.
+    - ``place``: returns the splats of a pose; calls its second argument with "drive" when the mesh is posed.
     """
 
     def __init__(

@@ -54,12 +54,8 @@ class SplatTrainer(ImageTrainer):
     ) -> None:
         """Set the initial tensors.
 
-        Parameters
-        ----------
-        splats, shared : Initial
-            Per-splat tensors, including "means", and all others.
-        binding, face_count, extent, seed, density : Tensor, int, float, int, Any
-            As for `Densifier`.
+        - ``splats``, ``shared``: per-splat tensors, including "means", and all others.
+        - ``binding``, ``face_count``, ``extent``, ``seed``, ``density``: as for `Densifier`.
         """
         initial = {**splats, **shared}
         self.splat_names, self.extent = tuple(splats), extent
@@ -116,10 +112,7 @@ class SplatTrainer(ImageTrainer):
     ) -> tuple[Rendering, Tensor]:
         """Rasterize and store data for densification; also returns (N,) whether a splat is visible.
 
-        Parameters
-        ----------
-        face_sizes : Tensor
-            (F,) metres per unit of the local scales, by triangle.
+        ``face_sizes``: (F,) metres per unit of the local scales, by triangle.
         """
         offset = opacities.new_zeros(len(opacities), 2).requires_grad_()
         rendering = rasterize_view(world, opacities, colors, view, self._background, means2d_offset=offset)
@@ -168,21 +161,14 @@ class Appearance(Protocol):
 
 
 class Start(NamedTuple):
-    """Initial splats with the size of their triangle.
-
-    Attributes
-    ----------
-    binding : Tensor
-        (N,) int64, the triangle of each splat; every triangle occurs at least once.
-    means : Tensor
-        (N, 3) in the triangles' frames, units of the triangle's size.
-    opacities : Tensor
-        (N,) in (0, 1).
-    """
+    """Initial splats with the size of their triangle."""
 
     binding: Tensor
+    """(N,) int64, the triangle of each splat; every triangle occurs at least once."""
     means: Tensor
+    """(N, 3) in the triangles' frames, units of the triangle's size."""
     opacities: Tensor
+    """(N,) in (0, 1)."""
 
 
 def one_per_triangle(face_count: int, opacity: float, device: str) -> Start:

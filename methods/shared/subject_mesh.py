@@ -22,12 +22,8 @@ Value = TypeVar("Value")
 class SubjectMesh:
     """A head model with fixed identity, driven by expression, pose and translation.
 
-    Parameters
-    ----------
-    shape : FloatArray
-        (S,) identity coefficients.
-    static_offset : FloatArray
-        (V, 3) metres, added to the shaped template.
+    - ``shape``: (S,) identity coefficients.
+    - ``static_offset``: (V, 3) metres, added to the shaped template.
     """
 
     def __init__(self, head: HeadAsset, shape: FloatArray, static_offset: FloatArray, device: str):
@@ -77,12 +73,8 @@ class SubjectMesh:
 class TrainingPoses:
     """Tracked values of the training timesteps of a clip, as arguments of its subject's mesh.
 
-    Attributes
-    ----------
-    row : dict[int, int]
-        Row of each timestep, in rising order.
-    arguments : dict[str, Tensor]
-        (T, n) values by name, as `SubjectMesh.arguments` gives them.
+    - ``row``: row of each timestep, in rising order.
+    - ``arguments``: (T, n) values by name, as `SubjectMesh.arguments` gives them.
     """
 
     def __init__(self, clip: Clip, mesh: SubjectMesh):

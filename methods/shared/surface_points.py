@@ -53,15 +53,9 @@ class SurfacePoints(NamedTuple):
 class MeshPoints:
     """Values of the vertices of a mesh, interpolated at points on it.
 
-    Parameters
-    ----------
-    points, faces, like : SurfacePoints, Tensor, Tensor
-        The points, the (F, 3) int64 triangles of the mesh, and a tensor of the type of the values.
-
-    Attributes
-    ----------
-    triangles : Tensor
-        (P,) int64 triangle of each point.
+    - ``points``, ``faces``, ``like``: the points, the (F, 3) int64 triangles of the mesh, and a tensor of the type of the
+      values.
+    - ``triangles``: (P,) int64 triangle of each point.
     """
 
     def __init__(self, points: SurfacePoints, faces: Tensor, like: Tensor):
@@ -86,12 +80,8 @@ def poisson_disk(
     ``count``. Equal arguments give equal points, unlike MeshLab's sampling, which uses a generator shared by the
     process.
 
-    Parameters
-    ----------
-    vertices, faces : FloatArray, IntArray
-        (V, 3) metres, (F, 3).
-    triangles : IntArray
-        Indices of the faces to sample.
+    - ``vertices``, ``faces``: (V, 3) metres, (F, 3).
+    - ``triangles``: indices of the faces to sample.
     """
     corners = np.asarray(vertices, np.float64)[faces[triangles]]
     areas = triangle_areas(vertices, faces[triangles])
@@ -121,14 +111,9 @@ def spread_points(
 ) -> SurfacePoints:
     """About ``count`` points on a head: one for each texel of its chart, or blue noise if it has none.
 
-    Parameters
-    ----------
-    vertices : FloatArray
-        (V, 3) metres.
-    chart : bool
-        Whether to use the head's chart, if it has one.
-    chart_without : IntArray | None
-        Vertices whose triangles get no texel of the chart.
+    - ``vertices``: (V, 3) metres.
+    - ``chart``: whether to use the head's chart, if it has one.
+    - ``chart_without``: vertices whose triangles get no texel of the chart.
     """
     faces, uv = np.asarray(head.faces), getattr(head, "uv", None)
     if uv is None or not chart:
@@ -149,12 +134,8 @@ def texel_points(uv: FloatArray, triangles: IntArray, count: int) -> SurfacePoin
 
     A triangle without area in the chart has no texel. Triangles that overlap in the chart have separate texels.
 
-    Parameters
-    ----------
-    uv : FloatArray
-        (F, 3, 2) texture coordinates of the corners.
-    triangles : IntArray
-        Indices of the triangles with texels.
+    - ``uv``: (F, 3, 2) texture coordinates of the corners.
+    - ``triangles``: indices of the triangles with texels.
     """
     a, b, c = np.moveaxis(uv[triangles], 1, 0)
     doubled = _cross(b - a, c - a)

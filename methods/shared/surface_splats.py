@@ -39,10 +39,7 @@ Avatar = TypeVar("Avatar")
 class PointSurface:
     """Points on the mesh of a subject with local axes: those of the triangle, unless a subclass overrides them.
 
-    Attributes
-    ----------
-    rest : Tensor
-        (N, 3) points on the neutral mesh, metres.
+    ``rest``: (N, 3) points on the neutral mesh, metres.
     """
 
     def __init__(self, mesh: SubjectMesh, points: SurfacePoints):
@@ -115,21 +112,14 @@ class ChartSurface(PointSurface):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSplats(Generic[Settings]):
-    """Content of an avatar's file. A derived class describes the tensors and the text of the settings.
-
-    Attributes
-    ----------
-    tensors : dict[str, Tensor]
-        Those of `shapes`.
-    points : SurfacePoints
-        Surface point of each of the N splats.
-    settings : Settings
-        Further values that rendering needs.
-    """
+    """Content of an avatar's file. A derived class describes the tensors and the text of the settings."""
 
     tensors: dict[str, Tensor]
+    """Those of `shapes`."""
     points: SurfacePoints
+    """Surface point of each of the N splats."""
     settings: Settings
+    """Further values that rendering needs."""
 
     KEY: ClassVar[str]
     """Key of the settings in the file's metadata."""
@@ -215,17 +205,9 @@ class SurfaceAvatar(StoredSplatAvatar, Generic[Stored]):
 class SurfaceTrainer(ImageTrainer, Generic[Config]):
     """A `Trainable` except for its loss. A derived class calls `_optimise` in its initialiser.
 
-    Parameters
-    ----------
-    inputs : Sequence[str]
-        Tracked parameters that the network takes.
-    border : str
-        Region of the head model whose triangles get no texel of the chart.
-
-    Attributes
-    ----------
-    points, rest : SurfacePoints, FloatArray
-        Surface point of each splat, and its (N, 3) position on the neutral mesh, metres.
+    - ``inputs``: tracked parameters that the network takes.
+    - ``border``: region of the head model whose triangles get no texel of the chart.
+    - ``points``, ``rest``: surface point of each splat, and its (N, 3) position on the neutral mesh, metres.
     """
 
     stored_class: ClassVar[Any]

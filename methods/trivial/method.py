@@ -66,10 +66,7 @@ def _rgba(clip: Clip, key: FrameKey) -> ByteArray:
 class _ImageAvatar:
     """An avatar that renders one of its stored images at the camera's size.
 
-    Parameters
-    ----------
-    arrays : Mapping[str, np.ndarray]
-        Arrays of the images, including ``head_model`` and ``background``.
+    ``arrays``: arrays of the images, including ``head_model`` and ``background``.
     """
 
     def __init__(self, arrays: Mapping[str, np.ndarray]):

@@ -9,15 +9,10 @@ from ...bench.specs import MethodSpec
 
 @dataclass(frozen=True)
 class NearestCameraConfig:
-    """Nearest training image.
-
-    Attributes
-    ----------
-    max_timesteps : int | None
-        Maximum number of stored timesteps, evenly spaced, which bounds the storage; None keeps all.
-    """
+    """Nearest training image."""
 
     max_timesteps: int | None = None
+    """Maximum number of stored timesteps, evenly spaced, which bounds the storage; None keeps all."""
 
 
 PRESETS = {name: {"budget": {"iterations": 1}} for name in ("smoke", "quick", "demo", "fast", "gpu", "paper")}

@@ -28,22 +28,15 @@ Values = Callable[[], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class CoderInput:
-    """What is encoded.
-
-    Attributes
-    ----------
-    tensors : Mapping[str, np.ndarray]
-        Arrays by name; those of the splats in the order in which they are stored.
-    weights : FloatArray | None
-        (N,) `importance` of the splats; None: all are equally visible.
-    metrics : Mapping[str, FloatArray]
-        Symmetric positive matrices M by name of vectors: an error e of a vector has the visible squared error e M e. The
-        identity for others.
-    """
+    """What is encoded."""
 
     tensors: Mapping[str, np.ndarray]
+    """Arrays by name; those of the splats in the order in which they are stored."""
     weights: FloatArray | None = None
+    """(N,) `importance` of the splats; None: all are equally visible."""
     metrics: Mapping[str, FloatArray] = field(default_factory=dict)
+    """Symmetric positive matrices M by name of vectors: an error e of a vector has the visible squared error e M e. The
+    identity for others."""
 
 
 class Coder:
@@ -156,16 +149,10 @@ class Coder:
         """(N, C) vectors through a Karhunen-Loeve transform (V. Goyal, IEEE Signal Processing Magazine 18(5), 2001): in
         coordinates in which equal errors are equally visible and different ones are uncorrelated, one step serves all.
 
-        Parameters
-        ----------
-        step : float | None
-            Step of the root of the visible squared error; by default that of the part.
-        scale : FloatArray | float
-            (N, 1) factors of the step.
-        units : FloatArray | None
-            (N, W) units of the numbers, repeated along the columns; where one is 0, the vectors are exact.
-        weights : FloatArray | None
-            To encode: (N,) weights of the vectors in the statistics; by default, those of the splats.
+        - ``step``: step of the root of the visible squared error; by default that of the part.
+        - ``scale``: (N, 1) factors of the step.
+        - ``units``: (N, W) units of the numbers, repeated along the columns; where one is 0, the vectors are exact.
+        - ``weights``: to encode: (N,) weights of the vectors in the statistics; by default, those of the splats.
         """
         step = getattr(self.precision, part) if step is None else step
         if not step or (units is not None and not units.all()):

@@ -76,27 +76,21 @@ EARLIER = Cutoffs(4 / 255, 1e-2)
 
 @dataclass(frozen=True)
 class Recipe:
-    """Changes of an avatar, applied in this order; None and 1 change nothing.
-
-    Attributes
-    ----------
-    splats : float
-        Fraction of the splats that are kept: those that contribute most to training views.
-    planes, lines : int | None
-        Samples along a side of a plane, along a line.
-    cutoffs : Cutoffs
-        Thresholds of the renderer.
-    step : float
-        Factor of all quantisation steps of a coded avatar.
-    """
+    """Changes of an avatar, applied in this order; None and 1 change nothing."""
 
     splats: float = 1.0
+    """Fraction of the splats that are kept: those that contribute most to training views."""
     degree: int | None = None
+
     planes: int | None = None
     lines: int | None = None
+    """Samples along a side of a plane, along a line."""
     storage: Storage = "exact"
+
     cutoffs: Cutoffs = USUAL
+    """Thresholds of the renderer."""
     step: float = 1.0
+    """Factor of all quantisation steps of a coded avatar."""
 
     @property
     def name(self) -> str:

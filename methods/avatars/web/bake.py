@@ -37,23 +37,16 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """An avatar to bake.
-
-    Attributes
-    ----------
-    rest : HeadPose
-        The pose at rest: expression, neck, jaw and eyes are 0, rotation and translation those of the
-        head.
-    root : FloatArray
-        (3,) position of the root joint without translation, the centre of ``rest.rotation``, metres.
-    joints : FloatArray
-        (4, 3) positions of neck, jaw, left and right eye in the head's frame.
-    """
+    """An avatar to bake."""
 
     avatar: SplatAvatar
+
     rest: HeadPose
+    """The pose at rest: expression, neck, jaw and eyes are 0, rotation and translation those of the head."""
     root: FloatArray
+    """(3,) position of the root joint without translation, the centre of ``rest.rotation``, metres."""
     joints: FloatArray
+    """(4, 3) positions of neck, jaw, left and right eye in the head's frame."""
 
     def pose(self, sliders: Sequence[Slider], values: Sequence[float] | FloatArray) -> HeadPose:
         """The pose for given slider values."""

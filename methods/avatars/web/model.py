@@ -22,31 +22,21 @@ PARENTS = (-1, 0, 0, 0)
 
 
 class Slider(NamedTuple):
-    """An expression, or a rotation of joints about an axis, with its morph.
-
-    Attributes
-    ----------
-    name : str
-        "" for motion that recorded sequences need besides the other sliders; it has no control.
-    joints : tuple[int, ...]
-        Indices into `JOINTS` of the joints that it rotates; none for an expression.
-    axis : int
-        0, 1 or 2 for x, y, z.
-    direction : tuple[float, ...]
-        (E,) expression coefficients at 1; () for joints.
-    low, high : float
-        Ends of the slider: multiples of ``direction``, or radians.
-    step : float
-        Value at which its morph has full weight.
-    """
+    """An expression, or a rotation of joints about an axis, with its morph."""
 
     name: str
+    """"" for motion that recorded sequences need besides the other sliders; it has no control."""
     joints: tuple[int, ...]
+    """Indices into `JOINTS` of the joints that it rotates; none for an expression."""
     axis: int
+    """0, 1 or 2 for x, y, z."""
     direction: tuple[float, ...]
+    """(E,) expression coefficients at 1; () for joints."""
     low: float
     high: float
+    """Ends of the slider: multiples of ``direction``, or radians."""
     step: float
+    """Value at which its morph has full weight."""
 
 
 class Moved(NamedTuple):
@@ -60,40 +50,29 @@ class Moved(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class WebAvatar:
-    """Content of a page as float arrays. N splats, M sliders.
-
-    Attributes
-    ----------
-    means, rotations, log_scales, logits : FloatArray
-        (N, 3), (N, 3, 3), (N, 3), (N,) of the face at rest.
-    harmonics : FloatArray
-        (N, 3, K), in 3DGS' order and signs, as functions of the direction from the camera to the
-        splat.
-    turned : bool
-        Whether harmonics rotate with the head; otherwise they are fixed in the world.
-    weights : FloatArray
-        (N, 4) skinning weights of `JOINTS`; the remainder to 1 stays with the shoulders.
-    joints : FloatArray
-        (4, 3) positions.
-    d_means, d_turns, d_log_scales, d_logits, d_colors : FloatArray
-        (M, N, 3), (M, N, 3), (M, N, 3), (M, N), (M, N, 3): changes at ``step`` before skinning; turns are rotation
-        vectors.
-    """
+    """Content of a page as float arrays. N splats, M sliders."""
 
     means: FloatArray
     rotations: FloatArray
     log_scales: FloatArray
     logits: FloatArray
+    """(N, 3), (N, 3, 3), (N, 3), (N,) of the face at rest."""
     harmonics: FloatArray
+    """(N, 3, K), in 3DGS' order and signs, as functions of the direction from the camera to the splat."""
     turned: bool
+    """Whether harmonics rotate with the head; otherwise they are fixed in the world."""
     weights: FloatArray
+    """(N, 4) skinning weights of `JOINTS`; the remainder to 1 stays with the shoulders."""
     joints: FloatArray
+    """(4, 3) positions."""
     sliders: tuple[Slider, ...]
+
     d_means: FloatArray
     d_turns: FloatArray
     d_log_scales: FloatArray
     d_logits: FloatArray
     d_colors: FloatArray
+    """(M, N, 3), (M, N, 3), (M, N, 3), (M, N), (M, N, 3): changes at ``step`` before skinning; turns are rotation vectors."""
 
     def moved(self, values: FloatArray, center: FloatArray) -> Moved:
         """The splats with the sliders at (M,) values, and their colours seen from a (3,) point."""

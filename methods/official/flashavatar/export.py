@@ -156,12 +156,8 @@ def chart_of_points(vertices: FloatArray, faces: IntArray, barycentric: FloatArr
     A point's triangle of the mesh is listed once for the point, small in the chart and such that the centre of the texel has
     the point's barycentric coordinates.
 
-    Parameters
-    ----------
-    vertices, faces, barycentric : FloatArray, IntArray, FloatArray
-        (V, 3) metres; (P, 3) triangle and (P, 3) barycentric coordinates of each point.
-    grid : int
-        Texels of a side.
+    - ``vertices``, ``faces``, ``barycentric``: (V, 3) metres; (P, 3) triangle and (P, 3) barycentric coordinates of each point.
+    - ``grid``: texels of a side.
     """
     if len(faces) > grid**2:
         raise InputError("head model", "points", f"at most {grid**2}, as many as texels", str(len(faces)))

@@ -59,16 +59,12 @@ def without_teeth(head: HeadAsset) -> tuple[IntArray, IntArray]:
 
 @dataclass(frozen=True, eq=False)
 class OfficialHead:
-    """A head model for their code: without teeth, with vertices in their order.
-
-    Attributes
-    ----------
-    order : IntArray
-        (V',) vertex of the clip's head for each of theirs; -1 for a vertex without a counterpart.
-    """
+    """A head model for their code: without teeth, with vertices in their order."""
 
     head: HeadAsset
+
     order: IntArray
+    """(V',) vertex of the clip's head for each of theirs; -1 for a vertex without a counterpart."""
     faces: IntArray
 
     @classmethod

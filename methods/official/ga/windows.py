@@ -23,20 +23,13 @@ skew."""
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A box of a camera's image with the principal point in its middle.
-
-    Attributes
-    ----------
-    camera : Camera
-        Camera of the box, with the principal point exactly in the middle and one focal length for
-        both axes.
-    left, top : int
-        Position of the box in the image, whole pixels; negative if it begins outside.
-    """
+    """A box of a camera's image with the principal point in its middle."""
 
     camera: Camera
+    """Camera of the box, with the principal point exactly in the middle and one focal length for both axes."""
     left: int
     top: int
+    """Position of the box in the image, whole pixels; negative if it begins outside."""
 
     def cut(self, image: ByteArray) -> ByteArray:
         """Crop of a camera's image to the box."""

@@ -36,16 +36,12 @@ class GHATracking:
     """Tracked parameters of one subject for their code, as in the native method.
 
     A point of the canonical head is ``R (S x) + T`` in the world: R, T of the head's root and neck, S metres a unit.
-
-    Attributes
-    ----------
-    rows : np.ndarray
-        (L,) vertices that correspond to their landmarks and to each hundredth vertex of their face
-        model.
     """
 
     driver: Driver
+
     rows: np.ndarray
+    """(L,) vertices that correspond to their landmarks and to each hundredth vertex of their face model."""
 
     @classmethod
     def of(cls, head: HeadAsset, subject: Subject) -> GHATracking:

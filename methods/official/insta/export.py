@@ -67,28 +67,19 @@ PART = 1000
 
 @dataclass(frozen=True, eq=False)
 class VideoMesh:
-    """A head model and one identity for their program: meshes without teeth, with the static offset.
-
-    Attributes
-    ----------
-    head, posed : HeadAsset, PosedSubject
-        The clip's own, with teeth if it has them.
-    kept : IntArray
-        (V',) vertices of their mesh.
-    faces : IntArray
-        (F', 3) triangles in their numbering.
-    masks : Mapping[str, bytes]
-        Files of regions, by name.
-    is_flames : bool
-        Whether vertices are FLAME's, so that triangles and regions are the official ones.
-    """
+    """A head model and one identity for their program: meshes without teeth, with the static offset."""
 
     head: HeadAsset
     posed: PosedSubject
+    """The clip's own, with teeth if it has them."""
     kept: IntArray
+    """(V',) vertices of their mesh."""
     faces: IntArray
+    """(F', 3) triangles in their numbering."""
     masks: Mapping[str, bytes]
+    """Files of regions, by name."""
     is_flames: bool
+    """Whether vertices are FLAME's, so that triangles and regions are the official ones."""
 
     @classmethod
     def of(cls, subject: Subject, head: HeadAsset, checkout: Checkout) -> VideoMesh:

@@ -100,25 +100,20 @@ OPTIONS = ("checkout", "python", "commit", "device")
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference of one metric in one task, official minus native, over orders.
-
-    Attributes
-    ----------
-    pairs : tuple[tuple[str, int], ...]
-        Subjects and orders for which both methods have complete results.
-    native, official : tuple[float, ...]
-        Mean over frames, then sequences, for each pair.
-    half_width : float | None
-        Half width of its 95 % interval (Student's t over pairs); None with a single pair.
-    """
+    """Difference of one metric in one task, official minus native, over orders."""
 
     task: str
     metric: str
+
     pairs: tuple[tuple[str, int], ...]
+    """Subjects and orders for which both methods have complete results."""
     native: tuple[float, ...]
     official: tuple[float, ...]
+    """Mean over frames, then sequences, for each pair."""
     difference: float
+
     half_width: float | None
+    """Half width of its 95 % interval (Student's t over pairs); None with a single pair."""
 
     def equivalence_p(self, margin: float) -> float | None:
         """P-value of two one-sided t-tests over pairs against differences of the margin and beyond; None with a single pair.

@@ -34,18 +34,10 @@ class TargetRasterizer(GaussianRasterizer):
     def forward(self, target_image: Tensor | None = None, **splats: Any) -> tuple[Tensor, ...]:  # type: ignore[override]
         """Render splats.
 
-        Parameters
-        ----------
-        target_image : Tensor | None
-            (4, H, W) straight colours and coverage in [0, 1]; none if it is empty.
-        splats : Any
-            Those of `GaussianRasterizer.forward`, by name.
-
-        Returns
-        -------
-        tuple[Tensor, ...]
-            Image (3, H, W), coverage (1, H, W), sums over pixels of weight times target colour (N, 3) and of weight (N,), and
-            radii (N,).
+        - ``target_image``: (4, H, W) straight colours and coverage in [0, 1]; none if it is empty.
+        - ``splats``: those of `GaussianRasterizer.forward`, by name.
+        - Returns image (3, H, W), coverage (1, H, W), sums over pixels of weight times target colour (N, 3) and of weight (N,),
+          and radii (N,).
         """
         image, alpha, radii = super().forward(**splats, alpha_point_id=0)
         sums = image.new_zeros(len(radii), 4)
@@ -107,17 +99,10 @@ def rasterize_chart(
 
     Of several triangles in a texel the first is taken.
 
-    Parameters
-    ----------
-    pos, tri : Tensor
-        (1, V, 4) clip coordinates with w = 1; (F, 3) triangles.
-    resolution : tuple[int, int]
-        Texels of both sides, S and S.
-
-    Returns
-    -------
-    tuple[Tensor, None]
-        (1, S, S, 4): first two barycentric coordinates, z, and the number of the triangle from 1, all 0 without a triangle.
+    - ``pos``, ``tri``: (1, V, 4) clip coordinates with w = 1; (F, 3) triangles.
+    - ``resolution``: texels of both sides, S and S.
+    - Returns (1, S, S, 4): first two barycentric coordinates, z, and the number of the triangle from 1, all 0 without a
+      triangle.
     """
     if resolution[0] != resolution[1]:
         raise ValueError("expected a square; the shim does not support other charts")

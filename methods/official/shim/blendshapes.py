@@ -74,16 +74,10 @@ def composite_blendshape(
 ) -> Tensor:
     """Sum over K expressions of coefficient times (initial + mask * basis), added to the mean.
 
-    Parameters
-    ----------
-    mean : Tensor
-        (P, ...).
-    basis, initial : Tensor, Tensor | None
-        (P, ..., K); the initial one has no gradient.
-    coefficients : Tensor
-        (K,), without gradient.
-    mask : Tensor | None
-        (P, K), without gradient; 1 by default.
+    - ``mean``: (P, ...).
+    - ``basis``, ``initial``: (P, ..., K); the initial one has no gradient.
+    - ``coefficients``: (K,), without gradient.
+    - ``mask``: (P, K), without gradient; 1 by default.
     """
     points, count = len(mean), len(coefficients)
     shares = coefficients.expand(points, count) if mask is None else mask * coefficients

@@ -105,16 +105,9 @@ def rasterize_meshes(
     z = 0 and triangles without area have none. Barycentric coordinates are exact; those of PyTorch3D divide by an area that
     is larger by `SMALLEST_AREA`.
 
-    Parameters
-    ----------
-    image_size : int
-        Pixels of a side, S.
-
-    Returns
-    -------
-    tuple[Tensor, Tensor, Tensor, None]
-        (1, S, S, 1) int64 triangle, -1 for none; (1, S, S, 1) float32 z; (1, S, S, 1, 3) float32 barycentric coordinates, -1 without a
-        triangle; nothing in place of distances.
+    - ``image_size``: pixels of a side, S.
+    - Returns (1, S, S, 1) int64 triangle, -1 for none; (1, S, S, 1) float32 z; (1, S, S, 1, 3) float32 barycentric coordinates,
+      -1 without a triangle; nothing in place of distances.
     """
     if blur_radius or faces_per_pixel != 1 or perspective_correct:
         raise ValueError("expected one triangle for each pixel, without blur and perspective correction")

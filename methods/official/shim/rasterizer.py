@@ -52,26 +52,15 @@ class GaussianRasterizer(nn.Module):
     ) -> tuple[Tensor, ...]:
         """Render (N,) splats.
 
-        Parameters
-        ----------
-        means3D, scales, rotations : Tensor | None
-            (N, 3), (N, 3), (N, 4) wxyz; metres.
-        means2D : Tensor
-            (N, 3) values that do not affect the image. Their gradient is the one with respect to
-            the projected means in normalised device units, with a zero third column.
-        opacities : Tensor
-            (N, 1) or (N,) in [0, 1].
-        shs, colors_precomp : Tensor | None
-            (N, K, 3) harmonics of which ``sh_degree`` are used, or (N, 3) colours; exactly one of
-            them.
-        alpha_point_id : int | None
-            Argument of GaussianBlendshapes' fork; 0 also returns the coverage by all splats.
-
-        Returns
-        -------
-        tuple[Tensor, ...]
-            Image (3, H, W); coverage (H, W) if requested; radii (N,), positive for every splat in view, regardless of its
-            opacity.
+        - ``means3D``, ``scales``, ``rotations``: (N, 3), (N, 3), (N, 4) wxyz; metres.
+        - ``means2D``: (N, 3) values that do not affect the image. Their gradient is the one with respect to the projected means
+          in normalised device units, with a zero third column.
+        - ``opacities``: (N, 1) or (N,) in [0, 1].
+        - ``shs``, ``colors_precomp``: (N, K, 3) harmonics of which ``sh_degree`` are used, or (N, 3) colours; exactly one of
+          them.
+        - ``alpha_point_id``: argument of GaussianBlendshapes' fork; 0 also returns the coverage by all splats.
+        - Returns image (3, H, W); coverage (H, W) if requested; radii (N,), positive for every splat in view, regardless of its
+          opacity.
         """
         to = self.raster_settings
         if (shs is None) == (colors_precomp is None):
