@@ -181,18 +181,18 @@ READ_IN_ONE_PLACE = {
         "bench/io/arrays.py",
         "bench/io/unpickle.py",
         "datasets/nersemble/benchmark/submission.py",
-        "methods/avatars/formats.py",  # an archive just made in memory
+        "methods/avatars/export.py",  # an archive just made in memory
     },
     r"\bcv2\.im(read|readmulti|decode|decodemulti|write|writemulti|encode)\b": {
         "bench/io/images.py",
         "methods/official/flashavatar/method.py",  # a text for the authors' program
-        "methods/official/gha/stages.py",  # a program for the authors' interpreter, run there
+        "methods/official/gha/method.py",  # a program for the authors' interpreter, run there
     },
     r"\bImage\.open\(|\bimageio\b|\bimread\(|\bimsave\(|skimage\.io\b|mimread|\.fromarray\(.*\.save\(": {
         "bench/io/images.py",  # the words, in the names of OpenCV's functions
         "bench/io/video.py",  # the package that brings ffmpeg
         "methods/official/gha/method.py",  # names of packages that the authors' code needs
-        "methods/official/shim/unused.py",
+        "methods/official/shim/blendshapes.py",
     },
     r"\bcv2\.VideoCapture\(": {
         "bench/io/video.py",

@@ -24,10 +24,9 @@ from ...bench.specs import CommandResult, command
 from ...datasets.clip import CaptureClip
 from ...datasets.ga.tracking import TeethPolicy, Tracking, find_head, read_animation
 from ...datasets.head.arrays import HeadArrays
-from ..ga.config import GAConfig
-from ..ga.method import DRIVING_FILE
+from ..ga.method import DRIVING_FILE, PLY_FILE, read_ga_splats, write_ga_splats
 from ..ga.spec import GA as GA_SPEC
-from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
+from ..ga.spec import GAConfig
 from ..shared.avatar_files import (
     HEAD_FILE,
     SUBJECT_FILE,

@@ -25,7 +25,7 @@ from ...datasets.head.rotations import (
 )
 from ..shared.avatar_files import Subject
 from ..shared.rendering import View, scene_center, view_of
-from .config import GHAConfig
+from .spec import GHAConfig
 
 POSE_SIZE = 6
 """Axis-angle and translation."""

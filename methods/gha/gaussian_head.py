@@ -14,9 +14,9 @@ from torch import Tensor
 from ...bench.contracts import Camera
 from ..ops.splats import WorldSplats, left_products
 from ..shared.rendering import rasterize_view, view_of
-from .config import GHAConfig
 from .driving import HeadMotion, Signal, influences
-from .networks import ATTRIBUTES, Controllers, Influences, Weights, encode, encode_pose, uniform
+from .mesh_head import ATTRIBUTES, Controllers, Influences, Weights, encode, encode_pose, uniform
+from .spec import GHAConfig
 
 POINTS = {"points": 3, "log_scales": 3, "quats": 4, "opacities": 1}
 """Attributes of a Gaussian except its features, with columns: canonical position and scale, rotation, opacity

@@ -18,27 +18,27 @@ from ...bench.errors import HeadbenchError, InputError
 from ...bench.io.arrays import Member, check_arrays, read_npz
 from ...bench.io.documents import parse_json, read_json
 from ...bench.native.dispatch import fits
-from ..avatars.compact.container import codec_of
+from ..avatars.compact.coder import codec_of
 from ..avatars.compact.layouts import grid, read_coded
 from ..shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, read_shared_head, read_subject, write_arrays
 from ..shared.rendering import changes_of
-from ..shared.subject_mesh import SubjectMesh, pose_key
+from ..shared.surface_points import SubjectMesh, pose_key
 from ..shared.threads import threads
 from . import kernel
-from .config import InstaConfig
 from .field import Architecture, Parameters, Prior, RadianceField
-from .marching import PosedSurface, Space, canonical_surface
-from .occupancy import Occupancy, occupied_space
-from .rendering import (
+from .marching import PosedSurface, Space, canonical_surface, mouth_triangles
+from .occupancy import (
     Marching,
+    Occupancy,
     PosedRays,
     box_corners,
     camera_rays,
+    occupied_space,
     pixels_by_blocks,
     pixels_of_hull,
     render_rays,
 )
-from .warp import mouth_triangles
+from .spec import InstaConfig
 
 RAYS_AT_ONCE = 1 << 15
 ROUND_SAMPLES = 4  # maximum; without gradients, testing the transmittance costs less than hidden samples

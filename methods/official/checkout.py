@@ -18,7 +18,7 @@ from ...bench.errors import InputError
 from ...bench.io.documents import checked, parse_json
 from ...bench.io.files import read_bytes
 from ...bench.process import environment
-from .config import INSTAOfficialConfig, OfficialConfig
+from .spec import INSTAOfficialConfig, OfficialConfig
 
 SHORTEST_COMMIT = 7
 PROBE_S = 300.0

@@ -30,7 +30,7 @@ from ..shared.loop import Fit, TrainingSummary, check_budget, check_training_spl
 from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import threads
 from .checkout import Checkout, Environment, Repository, inspect_checkout, inspect_interpreter
-from .config import OfficialConfig
+from .spec import OfficialConfig
 from .workplace import (
     LOCK,
     Listed,

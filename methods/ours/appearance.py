@@ -12,19 +12,18 @@ from torch import Tensor
 from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
-from ..ops.harmonics import harmonic_colors, initial_coefficients
-from ..ops.mesh import NORMAL, TriangleFrames
-from ..ops.planes import Bounds, line_offsets, plane_colors, smoothing
-from ..ops.splats import directions_to, to_world
+from ..ops.planes import Bounds, harmonic_colors, initial_coefficients, line_offsets, plane_colors, smoothing
+from ..ops.splats import NORMAL, TriangleFrames, directions_to, to_world
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View
 from ..shared.schedule import Timeline, log_linear, torch_generator
 from ..shared.splat_training import ShadedSplats, Start, one_per_triangle
-from ..shared.subject_mesh import BoundedCache, SubjectMesh, centroid_displacements
+from ..shared.surface_points import BoundedCache, SubjectMesh, centroid_displacements
 from .config import RAMP_FROM, OursConfig
 from .field import (
     COLOR_NETWORK,
     FIRST_LAYER,
+    RESIDUAL,
     CanonicalFrames,
     LocalSplats,
     apply_offsets,
@@ -38,7 +37,6 @@ from .field import (
     offset_layers,
     plane_box,
 )
-from .storage import RESIDUAL
 
 FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
 

@@ -10,12 +10,11 @@ from torch.nn.functional import linear
 
 from ...bench.configuration import build
 from ...bench.contracts import HeadAsset
-from ..ops.harmonics import C0
-from ..shared.networks import input_count, layer_names, layer_shapes, outputs_of
-from ..shared.subject_mesh import SubjectMesh
-from ..shared.surface_points import SurfacePoints
+from ..ops.planes import C0
+from ..shared.optimisation import input_count, layer_names, layer_shapes, outputs_of
+from ..shared.surface_points import SubjectMesh, SurfacePoints
 from ..shared.surface_splats import ChartSurface, PointSurface, SurfaceSplats
-from .config import RGBAvatarConfig
+from .spec import RGBAvatarConfig
 
 SHAPES = {"means": "mean_shapes", "quats": "quat_shapes", "colors": "color_shapes"}
 """Attributes that blendshapes change, and the names of their blendshapes."""

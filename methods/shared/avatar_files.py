@@ -20,7 +20,7 @@ from ...bench.io.documents import parse_json, read_json
 from ...bench.io.files import atomic_path, digest, write_json
 from ...datasets.head.arrays import OPTIONAL, STORED, HeadArrays, read_head, save_head
 from .loop import Fit, TrainingSummary
-from .subject_mesh import SubjectMesh
+from .surface_points import SubjectMesh
 from .tensor_files import read_safetensors
 
 Content = TypeVar("Content")

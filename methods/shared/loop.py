@@ -21,9 +21,9 @@ from ...bench.errors import InputError
 from ...bench.io.files import reading
 from ...bench.native.dispatch import is_cuda, pinned, to_device
 from ..splats.cpu import instruction_sets
-from .checkpoint import REMEDY, load_checkpoint, save_checkpoint
 from .optimisation import Optimiser
 from .schedule import Sampler, Timeline
+from .tensor_files import REMEDY, load_checkpoint, save_checkpoint
 from .threads import torch_on_one_thread
 
 CHECKPOINT = "checkpoint.safetensors"

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from ...bench.contracts import BoolArray, Camera, Changes, FloatArray, Frame, HeadPose, no_stage
 from ...bench.native.dispatch import is_cuda, on_host, to_device
-from ..avatars.compact.container import codec_of
+from ..avatars.compact.coder import codec_of
 from ..ops.splats import WorldSplats
 from ..splats import Rendering, pixel_weights, rasterize
-from ..splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
+from ..splats.request import ALPHA_MIN, TRANSMITTANCE_MIN
 from .avatar_files import HEAD_FILE
-from .subject_mesh import pose_key
+from .surface_points import pose_key
 
 Value = TypeVar("Value")
 

@@ -17,18 +17,25 @@ from ...bench.contracts import Clip, HeadAsset, HeadPose
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...datasets.head.rotations import axis_angle_to_quaternion, matrix_to_quaternion, quaternion_to_matrix
-from ..ops.mesh import TriangleFrames, chart_axes
-from ..ops.splats import WorldSplats, apply_matrices, left_products, to_world
+from ..ops.splats import TriangleFrames, WorldSplats, apply_matrices, chart_axes, left_products, to_world
 from .avatar_files import AVATAR_FILE, Subject, clip_mesh, finish_fit, read_stored
 from .config import SurfaceSettings
-from .image_training import ImageTrainer
 from .loop import Fit
 from .method import TrainedMethod
-from .networks import input_count, tracked_inputs
+from .optimisation import input_count, tracked_inputs
 from .rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from .schedule import Sampler
-from .subject_mesh import BoundedCache, SubjectMesh, TrainingPoses
-from .surface_points import MeshPoints, SurfacePoints, point_tensors, spread_points, take_points
+from .splat_training import ImageTrainer
+from .surface_points import (
+    BoundedCache,
+    MeshPoints,
+    SubjectMesh,
+    SurfacePoints,
+    TrainingPoses,
+    point_tensors,
+    spread_points,
+    take_points,
+)
 from .tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, write_tensors
 
 Settings = TypeVar("Settings")

@@ -5,9 +5,8 @@ from __future__ import annotations
 from torch import Tensor
 
 from . import cpu, cuda
-from .constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from .reference import rasterize_reference
-from .request import ArrayLike, Rendering, Request, make_request
+from .request import ALPHA_MIN, TRANSMITTANCE_MIN, ArrayLike, Rendering, Request, make_request
 
 
 def rasterize(

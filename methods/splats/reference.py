@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from .constants import ALPHA_MAX, FRUSTUM_MARGIN, QUATERNION_MIN, RADIUS_MAX, TILE
-from .request import Rendering, Request
+from .request import ALPHA_MAX, FRUSTUM_MARGIN, QUATERNION_MIN, RADIUS_MAX, TILE, Rendering, Request
 
 CHUNK = 1024
 """Splats composited at once within a tile."""

@@ -42,7 +42,7 @@ TEXTURED_MESH = MethodSpec(
     name="textured-mesh",
     default=True,
     summary="The posed mesh with the median colours of the training images: what tracking alone is worth.",
-    implementation="headbench.methods.trivial.textured_mesh:TexturedMesh",
+    implementation="headbench.methods.trivial.method:TexturedMesh",
     trivial=True,
     presets=PRESETS,
 )

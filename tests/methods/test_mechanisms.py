@@ -6,7 +6,7 @@ import torch
 
 from headbench.bench.contracts import Clip, no_progress
 from headbench.bench.engine.cell import training_poses
-from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.ours.method import OursAvatar
 from headbench.metrics.mechanism import dynamic_splats
 
 from .ours.toy import store

@@ -22,17 +22,17 @@ from ....bench.errors import InputError
 from ....bench.io.arrays import read_npz
 from ....bench.io.documents import read_json
 from ....bench.io.files import digest
-from ...flashavatar.hyper_gaussians import gaussian_shapes
 from ...flashavatar.method import FlashAvatarAvatar
+from ...flashavatar.model import gaussian_shapes
 from ...ga.method import GAAvatar
-from ...gbs.avatar import GBSAvatar
-from ...gbs.storage import EXPRESSIONS
-from ...gha.avatar import CONFIG, TABLE, GHAAvatar
+from ...gbs.blendshapes import EXPRESSIONS
+from ...gbs.method import GBSAvatar
 from ...gha.gaussian_head import POINTS
+from ...gha.method import CONFIG, TABLE, GHAAvatar
 from ...insta.avatar import FIELD_FILE, SETTINGS, SETTINGS_FILE, InstaAvatar
-from ...ops.harmonics import sh_basis, sh_degree
-from ...ours.avatar import OursAvatar
-from ...ours.storage import DYNAMIC, PER_SPLAT, splat_columns
+from ...ops.planes import sh_basis, sh_degree
+from ...ours.field import DYNAMIC, PER_SPLAT, splat_columns
+from ...ours.method import OursAvatar
 from ...rgbavatar.method import RGBAvatarAvatar
 from ...rgbavatar.model import SHAPES, blend_weights
 from ...shared.avatar_files import (
@@ -44,15 +44,25 @@ from ...shared.avatar_files import (
     save_shared_head,
 )
 from ...shared.capacity import training_poses
-from ...shared.networks import tracked_inputs
+from ...shared.optimisation import tracked_inputs
 from ...shared.surface_points import point_tensors
 from ...shared.surface_splats import SurfaceAvatar
 from ...shared.tensor_files import read_safetensors
-from ..views import importance, training_views
-from .coder import Coder, CoderInput, visibility_classes
-from .container import CODEC, Content, write_content
-from .field import field, field_metrics
-from .layouts import COLOURS, Layout, blended, bound, code_subject, grid, networks, offsets, reduced
+from ..harmonics import importance, training_views
+from .coder import CODEC, Coder, CoderInput, Content, visibility_classes, write_content
+from .layouts import (
+    COLOURS,
+    Layout,
+    blended,
+    bound,
+    code_subject,
+    field,
+    field_metrics,
+    grid,
+    networks,
+    offsets,
+    reduced,
+)
 from .precision import Precision
 
 CODEC_VERSION = 4

@@ -19,7 +19,7 @@ from ....bench.io.images import quantise
 from ....bench.protocol import evenly_with_ends
 from ....bench.specs import CommandResult, command
 from ...shared.avatar_files import COMPACT_FILE, read_shared_head
-from ...shared.losses import picture_ssim, psnr, squared_error
+from ...shared.optimisation import picture_ssim, psnr, squared_error
 from ..export import neutral_pose
 from .codecs import DRIVING_FILE, parts_of, write_coded
 from .precision import EXACT

@@ -21,13 +21,11 @@ from ....datasets.head.arrays import faces_in_region
 from ....datasets.head.subject import PosedSubject
 from ....datasets.head.teeth import with_teeth_where_possible
 from ....datasets.images import write_image
-from ...gbs.config import BlendshapeTraining, GBSConfig
+from ...gbs.spec import BlendshapeTraining, GBSConfig
 from ...shared.avatar_files import SUBJECT_FILE, Subject, head_arrays
 from ...shared.loop import Fit
 from ...shared.schedule import DensifySchedule, Timeline
 from ..checkout import Checkout, Repository
-from ..config import GBSOfficialConfig, option_words
-from ..ga.export import check_mark, mark
 from ..ga.head_files import (
     OfficialHead,
     obj_text,
@@ -35,9 +33,9 @@ from ..ga.head_files import (
     pickled,
     write_landmarks,
 )
-from ..ga.method import RENDERED, TRAINED
+from ..ga.method import RENDERED, TRAINED, check_mark, mark
 from ..method import OfficialMethod, read_identity
-from ..spec import GBS_OFFICIAL
+from ..spec import GBS_OFFICIAL, GBSOfficialConfig, option_words
 from ..video import (
     at_rest,
     check_masks,

@@ -23,8 +23,8 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from . import blended, blendshapes, meshes, rasterizer
-from .unused import OF_FLASHAVATAR, REPLACED, Silent
+from . import blended, blendshapes
+from .blendshapes import OF_FLASHAVATAR, REPLACED, Silent
 
 
 def install(threads: int, code: str) -> None:
@@ -35,14 +35,14 @@ def install(threads: int, code: str) -> None:
     """
     torch.set_num_threads(threads)
     own = blended.RASTERIZER if code == "blended splats" else {}
-    _module("diff_gaussian_rasterization", rasterizer.PUBLIC | blendshapes.RASTERIZER | own)
+    _module("diff_gaussian_rasterization", blended.PUBLIC | blendshapes.RASTERIZER | own)
     _module("diff_gaussian_rasterization._C", blendshapes.RASTERIZER_KERNELS)
     _module("simple_knn")
     _module("simple_knn._C", {"distCUDA2": mean_square_distances, **blendshapes.NEIGHBOURS})
     packages = {
-        "blendshapes": blendshapes.PACKAGES,
-        "charted splats": {**meshes.PACKAGES, **OF_FLASHAVATAR},
-        "blended splats": blended.PACKAGES,
+        "blendshapes": blendshapes.OF_BLENDSHAPES,
+        "charted splats": {**blendshapes.OF_MESHES, **OF_FLASHAVATAR},
+        "blended splats": blended.OF_BLENDED,
     }
     # Imported by scripts, but not used: no mesh is drawn, no external OBJ file read and no LPIPS measured.
     context = dict.fromkeys(("RasterizeCudaContext", "RasterizeGLContext"), Silent)

@@ -12,8 +12,8 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png, write_png
 from headbench.bench.io.provenance import COMPOSITE, RENDER, SYNTHETIC, note
 from headbench.bench.io.video import write_browser_video
-from headbench.methods.avatars.formats import STANDARD
-from headbench.methods.shared.ply import read_ply, write_ply
+from headbench.methods.avatars.export import STANDARD
+from headbench.methods.shared.tensor_files import read_ply, write_ply
 
 TERMS = "http://cv.iptc.org/newscodes/digitalsourcetype/"
 

@@ -15,17 +15,16 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga import reader
 from headbench.datasets.ga.reader import read_capture
 from headbench.methods.avatars.export import export_ply, neutral_pose
-from headbench.methods.avatars.harmonics import fit_harmonics, sphere
+from headbench.methods.avatars.harmonics import fit_harmonics, sphere, visibility
 from headbench.methods.avatars.settings import ExportPlySettings
-from headbench.methods.avatars.views import visibility
 from headbench.methods.avatars.web.export import export_page
 from headbench.methods.avatars.web.settings import ExportHtmlSettings
-from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
-from headbench.methods.gbs.config import GBSConfig
+from headbench.methods.ga.spec import GAConfig
 from headbench.methods.gbs.method import GBS
-from headbench.methods.ops.harmonics import sh_basis
-from headbench.methods.ours.avatar import OursAvatar
+from headbench.methods.gbs.spec import GBSConfig
+from headbench.methods.ops.planes import sh_basis
+from headbench.methods.ours.method import OursAvatar
 from headbench.methods.shared.rendering import PosedSplats, view_of
 from headbench.methods.splats import rasterize
 from headbench.methods.trivial.method import NearestCamera

@@ -8,8 +8,14 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from headbench.bench.errors import InputError
-from headbench.methods.gbs.blendshapes import Entries, difference_widths
-from headbench.methods.gbs.storage import EXPRESSIONS, MEMBERS, stored_of, write_avatar
+from headbench.methods.gbs.blendshapes import (
+    EXPRESSIONS,
+    MEMBERS,
+    Entries,
+    difference_widths,
+    stored_of,
+    write_avatar,
+)
 from headbench.methods.shared.avatar_files import AVATAR_FILE
 from headbench.methods.shared.surface_points import SurfacePoints, full_barycentric
 from headbench.methods.shared.tensor_files import read_safetensors

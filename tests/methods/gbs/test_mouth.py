@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.methods.gbs.config import GBSConfig
-from headbench.methods.gbs.mouth import (
+from headbench.methods.gbs.spec import GBSConfig
+from headbench.methods.gbs.training import (
     MouthCylinder,
     mouth_cylinder,
     padded_offset,

@@ -9,10 +9,16 @@ from skimage.metrics import structural_similarity
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.methods.gbs.blendshapes import PointMotions, apply_pose, difference_widths
-from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
 from headbench.methods.gbs.method import GBS
-from headbench.methods.gbs.mouth import mouth_cylinder, padded_offset, with_mouth
-from headbench.methods.gbs.training import DIFFERENCES, GBSTraining, sample_count
+from headbench.methods.gbs.spec import BlendshapeTraining, GBSConfig
+from headbench.methods.gbs.training import (
+    DIFFERENCES,
+    GBSTraining,
+    mouth_cylinder,
+    padded_offset,
+    sample_count,
+    with_mouth,
+)
 from headbench.methods.shared.avatar_files import Subject
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.splats import rasterize

@@ -23,8 +23,14 @@ from headbench.methods.gha.mesh_head import (
     tet_grid,
     vertex_discs,
 )
-from headbench.methods.gha.mesh_training import MeshTraining, mesh_phase, roughness, soft_overlap
-from headbench.methods.gha.tracked_motion import TangentDistance, outer_vertices
+from headbench.methods.gha.mesh_training import (
+    MeshTraining,
+    TangentDistance,
+    mesh_phase,
+    outer_vertices,
+    roughness,
+    soft_overlap,
+)
 from headbench.methods.ops.planes import encode
 from headbench.methods.shared.loop import Fit
 

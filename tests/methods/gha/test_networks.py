@@ -6,10 +6,9 @@ import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from headbench.methods.gha.config import GHAConfig
 from headbench.methods.gha.gaussian_head import POINTS, FeatureImage, GaussianHead, SuperResolution
-from headbench.methods.gha.mesh_head import MeshHead
-from headbench.methods.gha.networks import Mlp
+from headbench.methods.gha.mesh_head import MeshHead, Mlp
+from headbench.methods.gha.spec import GHAConfig
 
 GROUND = torch.tensor([1.0, 0.5, 0.25], dtype=torch.float64)
 PUBLISHED_EXPRESSION = 64  # coefficients of the published face model

@@ -5,8 +5,8 @@ import torch
 
 from headbench.datasets.head.model import HeadModel
 from headbench.methods.gha.driving import bounds, training_scene
-from headbench.methods.gha.networks import Controllers
-from headbench.methods.gha.tracked_motion import TrackedMotion
+from headbench.methods.gha.mesh_head import Controllers
+from headbench.methods.gha.mesh_training import TrackedMotion
 from headbench.methods.ops.planes import encode
 
 from .small import small_config

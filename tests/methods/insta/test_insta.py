@@ -12,9 +12,8 @@ from headbench.bench.errors import InputError
 from headbench.methods.insta import avatar as avatar_module
 from headbench.methods.insta import kernel
 from headbench.methods.insta.avatar import FIELD_FILE, SETTINGS_FILE, InstaAvatar
-from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.method import Insta
-from headbench.methods.insta.spec import INSTA
+from headbench.methods.insta.spec import INSTA, InstaConfig
 
 from ..toy_clip import check_frame, first_view
 from .small import SMALL

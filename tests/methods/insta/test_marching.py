@@ -8,7 +8,7 @@ import torch
 
 from headbench.methods.insta import kernel
 from headbench.methods.insta.marching import CanonicalSurface, Rays, Space, occupied_at
-from headbench.methods.insta.rendering import camera_rays, pixels_by_blocks
+from headbench.methods.insta.occupancy import camera_rays, pixels_by_blocks
 
 from ...datasets.head.toy import toy_head
 from ..toy_clip import look_at

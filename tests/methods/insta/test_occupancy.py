@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.field import Prior
 from headbench.methods.insta.occupancy import occupied_space
+from headbench.methods.insta.spec import InstaConfig
 
 from .small import make_stage
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from headbench.bench.contracts import Camera
-from headbench.methods.insta.rendering import (
+from headbench.methods.insta.occupancy import (
     box_corners,
     camera_rays,
     composite,

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from headbench.datasets.srgb import srgb_to_linear
-from headbench.methods.insta.config import InstaConfig
-from headbench.methods.insta.training import color_loss, depth_loss, target_colors, to_linear, to_srgb
+from headbench.methods.insta.method import color_loss, depth_loss, target_colors, to_linear, to_srgb
+from headbench.methods.insta.spec import InstaConfig
 
 
 def test_the_color_loss_is_hubers():

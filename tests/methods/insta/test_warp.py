@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 
 from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.methods.insta import kernel
-from headbench.methods.insta.marching import CanonicalSurface, Rays
-from headbench.methods.insta.warp import (
+from headbench.methods.insta.marching import (
     Blend,
+    CanonicalSurface,
+    Rays,
     blended,
     canonical_from_posed,
     edge_neighbours,

@@ -8,7 +8,7 @@ import pytest
 from headbench.bench.configuration import deciding_settings
 from headbench.bench.errors import InputError
 from headbench.methods.official.checkout import Repository, inspect_checkout
-from headbench.methods.official.config import GAOfficialConfig
+from headbench.methods.official.spec import GAOfficialConfig
 
 NAME = "ga"
 

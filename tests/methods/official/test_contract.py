@@ -16,8 +16,8 @@ from headbench.bench.process import ProgramError
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
 from headbench.methods.official import needs
 from headbench.methods.official.flashavatar import method as flashavatar
-from headbench.methods.official.gha.export import GHATracking
-from headbench.methods.official.insta import export as insta
+from headbench.methods.official.gha.method import GHATracking
+from headbench.methods.official.insta import method as insta
 from headbench.methods.official.method import RENDERING, RENDERING_LOG, TRAINING, TRAINING_LOG
 from headbench.methods.official.rgbavatar import method as rgbavatar
 from headbench.methods.official.workplace import check_export

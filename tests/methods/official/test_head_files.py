@@ -10,7 +10,6 @@ import scipy.sparse
 from headbench.bench.io.files import write_bytes
 from headbench.bench.process import run_program
 from headbench.datasets.head.teeth import lip_rings, with_teeth
-from headbench.methods.official.ga.export import MARK_STEP, mark
 from headbench.methods.official.ga.head_files import (
     TEMPLATE_FILE,
     OfficialHead,
@@ -18,6 +17,7 @@ from headbench.methods.official.ga.head_files import (
     SparseMatrix,
     pickled,
 )
+from headbench.methods.official.ga.method import MARK_STEP, mark
 
 from ...datasets.head.toy import toy_head
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Camera
-from headbench.methods.official.ga.windows import around, inside
+from headbench.methods.official.ga.head_files import around, inside
 
 
 def camera(cx, cy, width=550, height=802, focal=2050.0):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from headbench.methods.ops.harmonics import C0, coefficient_count, harmonic_colors, sh_basis
+from headbench.methods.ops.planes import C0, coefficient_count, harmonic_colors, sh_basis
 
 
 def real_harmonics(directions, degree):

@@ -11,12 +11,11 @@ from headbench.bench.native import dispatch
 from headbench.datasets.head.arrays import faces_in_region
 from headbench.methods.ops.planes import Bounds, line_offsets
 from headbench.methods.ours.appearance import penalty_weights, softened
-from headbench.methods.ours.avatar import LineOffsets, OursAvatar
 from headbench.methods.ours.field import blend_lines, line_table, normalised_weight, offset_layers
-from headbench.methods.ours.method import Ours
+from headbench.methods.ours.method import LineOffsets, Ours, OursAvatar
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.splat_training import BoundTraining
-from headbench.methods.shared.subject_mesh import pose_key
+from headbench.methods.shared.surface_points import pose_key
 from headbench.methods.splats.cpu import instruction_sets
 
 from ..toy_clip import first_view

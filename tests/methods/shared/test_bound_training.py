@@ -15,7 +15,7 @@ from headbench.methods.shared.loop import check_training_split
 from headbench.methods.shared.rendering import scene_extent
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.splat_training import BoundTraining, ShadedSplats
-from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.shared.surface_points import SubjectMesh
 from headbench.methods.splats import rasterize
 
 PENALTY = 7.0

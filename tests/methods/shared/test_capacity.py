@@ -7,10 +7,10 @@ from math import ceil
 import pytest
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
-from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
+from headbench.methods.ga.spec import GAConfig
 from headbench.methods.gbs.method import GBS
+from headbench.methods.gbs.spec import BlendshapeTraining, GBSConfig
 from headbench.methods.shared.capacity import with_sizes
 from headbench.methods.shared.config import Capacity, SplatTraining
 

@@ -7,8 +7,8 @@ import torch
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.methods.shared.checkpoint import load_checkpoint, save_checkpoint
 from headbench.methods.shared.loop import CHECKPOINT, Fit, train
+from headbench.methods.shared.tensor_files import load_checkpoint, save_checkpoint
 
 
 def test_what_was_saved_comes_back(tmp_path):

@@ -10,14 +10,14 @@ from scipy.signal import lfilter
 
 from headbench.bench.contracts import FrameKey
 from headbench.datasets.synthetic.plan import FRONTAL, SyntheticSettings, load_geometry, plan_subject
-from headbench.methods.gbs.config import GBSConfig
 from headbench.methods.gbs.method import GBS
-from headbench.methods.ours.capacity import plan_capacity
+from headbench.methods.gbs.spec import GBSConfig
 from headbench.methods.ours.config import OursConfig, PlannedCapacity
+from headbench.methods.ours.method import plan_capacity
 from headbench.methods.shared.avatar_files import clip_mesh
+from headbench.methods.shared.capacity import CONFIRMED, PictureMotion, picture_motion
 from headbench.methods.shared.config import Capacity
-from headbench.methods.shared.evidence import CONFIRMED, PictureMotion, picture_motion
-from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.shared.surface_points import SubjectMesh
 
 from ..toy_clip import ToyClip, splat_pictures
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.methods.shared.ply import LARGEST_LOGIT, read_names, read_ply, write_ply
+from headbench.methods.shared.tensor_files import LARGEST_LOGIT, read_names, read_ply, write_ply
 
 TABLE = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
 

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull
 from headbench.bench.errors import InputError
 from headbench.datasets.head.model import HeadModel
 from headbench.methods.shared.avatar_files import clip_mesh
-from headbench.methods.shared.subject_mesh import BoundedCache, SubjectMesh, mouth_mask
+from headbench.methods.shared.surface_points import BoundedCache, SubjectMesh, mouth_mask
 
 from ..toy_clip import first_view, look_at
 

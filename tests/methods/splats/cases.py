@@ -7,7 +7,7 @@ from typing import NamedTuple
 import pytest
 import torch
 
-from headbench.methods.benchmarks.scenes import (
+from headbench.methods.benchmarks.splats import (
     DrawnScene,
     SplatScene,
     relative_error,

@@ -15,7 +15,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from headbench.methods.benchmarks.scenes import (
+from headbench.methods.benchmarks.splats import (
     DrawnScene,
     SplatScene,
     cloud,

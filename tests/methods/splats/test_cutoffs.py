@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from headbench.methods.benchmarks.scenes import SplatScene, cloud
+from headbench.methods.benchmarks.splats import SplatScene, cloud
 from headbench.methods.splats import cuda, rasterize
 
 from .cases import backends, check_kernels, needs_kernel, request_of

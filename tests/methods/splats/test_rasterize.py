@@ -9,7 +9,7 @@ import torch
 
 from headbench.bench.errors import UnavailableError
 from headbench.bench.native.loader import Kernel
-from headbench.methods.benchmarks.scenes import (
+from headbench.methods.benchmarks.splats import (
     SplatScene,
     cloud,
 )

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from headbench.methods.benchmarks.scenes import SplatScene, cloud
+from headbench.methods.benchmarks.splats import SplatScene, cloud
 from headbench.methods.splats import available_backends, cuda, rasterize
 
 from .cases import backends, request_of

@@ -9,7 +9,7 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.mesh_pictures import draw_mesh
-from headbench.methods.trivial.textured_mesh import TexturedMesh, _centres, _medians, texels
+from headbench.methods.trivial.method import TexturedMesh, _centres, _medians, texels
 
 RNG = np.random.default_rng(0)
 

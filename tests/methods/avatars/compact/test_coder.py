@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from headbench.methods.avatars.compact.coder import Coder, CoderInput, scale_of, visibility_classes
-from headbench.methods.avatars.compact.container import pack
+from headbench.methods.avatars.compact.coder import Coder, CoderInput, pack, scale_of, visibility_classes
 from headbench.methods.avatars.compact.precision import EXACT, Precision
 
 

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 from safetensors.numpy import load_file, save_file
 
 from headbench.bench.errors import InputError
-from headbench.methods.avatars.compact.container import (
+from headbench.methods.avatars.compact.coder import (
     CODEC,
     DATA,
     KEY,

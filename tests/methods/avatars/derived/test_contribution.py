@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from headbench.methods.avatars.derived.recipes import contributions, most_contributing
-from headbench.methods.avatars.views import squared_contribution, training_views
+from headbench.methods.avatars.harmonics import squared_contribution, training_views
 from headbench.methods.shared.rendering import PosedSplats, view_of
 from headbench.methods.splats import rasterize
 

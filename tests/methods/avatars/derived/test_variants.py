@@ -5,11 +5,10 @@ import pytest
 import torch
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.methods.avatars.derived import ga_variants, ours_variants
-from headbench.methods.avatars.derived.recipes import EARLY, GA, OURS, Recipe
-from headbench.methods.ga.config import GAConfig
+from headbench.methods.avatars.derived.recipes import EARLY, GA, OURS, Recipe, ga_variants, ours_variants
 from headbench.methods.ga.method import GA as GAMethod
 from headbench.methods.ga.method import GAAvatar
+from headbench.methods.ga.spec import GAConfig
 from headbench.methods.ours.method import Ours
 from headbench.methods.shared.config import SplatTraining
 
@@ -74,7 +73,7 @@ def test_variants_are_read_back_from_smaller_own_files(
     folder = request.getfixturevalue(method.name)
     whole = method().load(folder, device="cpu")
     expected = picture(whole, clip)
-    variants = by_name(derive.variants, folder, clip)
+    variants = by_name(derive, folder, clip)
     assert set(variants) == {recipe.name for recipe in recipes}
     quality = {}
     for name in (*MADE, *more):
@@ -94,7 +93,7 @@ def test_variants_are_read_back_from_smaller_own_files(
 def test_pruning_keeps_what_contributes(ga, clip, tmp_path):
     """Half of the splats, the most contributing, are nearer to the whole than the other half."""
     whole = GAAvatar.read(ga, "cpu")
-    half = by_name(ga_variants.variants, ga, clip)["splats50"].make(tmp_path)
+    half = by_name(ga_variants, ga, clip)["splats50"].make(tmp_path)
     means = {tuple(row) for row in half.splat_tensors["means"].tolist()}
     others = torch.tensor([tuple(row) not in means for row in whole.splat_tensors["means"].tolist()])
     rest = {name: value[others] for name, value in whole.splat_tensors.items()}
@@ -106,7 +105,7 @@ def test_pruning_keeps_what_contributes(ga, clip, tmp_path):
 
 def test_a_lower_degree_is_the_whole_avatar_with_zeros_above(ga, clip, tmp_path):
     whole = GAAvatar.read(ga, "cpu")
-    lower = by_name(ga_variants.variants, ga, clip)["sh1"].make(tmp_path)
+    lower = by_name(ga_variants, ga, clip)["sh1"].make(tmp_path)
     zeroed = dict(whole.splat_tensors)
     zeroed["sh_rest"] = zeroed["sh_rest"].clone()
     assert zeroed["sh_rest"][:, :, 3:].any()
@@ -119,6 +118,6 @@ def test_a_lower_degree_is_the_whole_avatar_with_zeros_above(ga, clip, tmp_path)
 
 def test_a_recipe_that_changes_nothing_is_left_out(clip, tmp_path):
     store(clip, tmp_path)  # 8 samples a plane, 6 a line
-    names = set(by_name(ours_variants.variants, tmp_path, clip))
+    names = set(by_name(ours_variants, tmp_path, clip))
     assert not names & {"planes64", "planes32", "lines16"}
     assert {"coded", "splats50"} <= names
