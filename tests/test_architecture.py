@@ -186,7 +186,7 @@ READ_IN_ONE_PLACE = {
     r"\bcv2\.im(read|readmulti|decode|decodemulti|write|writemulti|encode)\b": {
         "bench/io/images.py",
         "methods/official/flashavatar/method.py",  # a text for the authors' program
-        "methods/official/gha/method.py",  # a program for the authors' interpreter, run there
+        "methods/official/gha/stages.py",  # a program for the authors' interpreter, run there
     },
     r"\bImage\.open\(|\bimageio\b|\bimread\(|\bimsave\(|skimage\.io\b|mimread|\.fromarray\(.*\.save\(": {
         "bench/io/images.py",  # the words, in the names of OpenCV's functions

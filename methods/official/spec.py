@@ -220,7 +220,7 @@ GA_OFFICIAL = MethodSpec(
     summary="GaussianAvatars by its authors' code, in your checkout and environment; needs CUDA or device=cpu-shim.",
     implementation="headbench.methods.official.ga.method:GAOfficial",
     config="headbench.methods.official.spec:GAOfficialConfig",
-    renders="headbench.methods.official.workplace:gaussian_avatars",
+    renders="headbench.methods.official.renders:gaussian_avatars",
     presets={
         name: preset | {"arguments": _short_rates(SHORT_SPLATS, SHORT)}
         for name, preset in _lengths(smoke=60, demo=2_000, fast=4_000).items()
@@ -234,7 +234,7 @@ TGA_OFFICIAL = MethodSpec(
     summary="The method ours by its authors' code, in your checkout and environment; needs CUDA or device=cpu-shim.",
     implementation="headbench.methods.official.tga.method:TGAOfficial",
     config="headbench.methods.official.spec:TGAOfficialConfig",
-    renders="headbench.methods.official.workplace:gaussian_avatars",
+    renders="headbench.methods.official.renders:gaussian_avatars",
     # Their feature lines start at a fixed iteration, so shorter runs do not train the method.
     presets=_lengths(paper=PAPER_ITERATIONS),
     **_paper_of(OURS),
@@ -248,7 +248,7 @@ GBS_OFFICIAL = MethodSpec(
     summary="GaussianBlendshapes by its authors' code, in your checkout and environment; needs CUDA or device=cpu-shim.",
     implementation="headbench.methods.official.gbs.method:GBSOfficial",
     config="headbench.methods.official.spec:GBSOfficialConfig",
-    renders="headbench.methods.official.workplace:gaussian_blendshapes",
+    renders="headbench.methods.official.renders:gaussian_blendshapes",
     presets=_lengths_of(GBS)
     | {
         name: {
@@ -280,7 +280,7 @@ INSTA_OFFICIAL = MethodSpec(
     summary="INSTA by its authors' code, built in your checkout; needs CUDA.",
     implementation="headbench.methods.official.insta.method:INSTAOfficial",
     config="headbench.methods.official.spec:INSTAOfficialConfig",
-    renders="headbench.methods.official.workplace:insta",
+    renders="headbench.methods.official.renders:insta",
     # The authors' settings have no schedule to shorten.
     presets=_lengths_of(INSTA),
     monocular=True,
