@@ -49,6 +49,7 @@ from ...shared.surface_points import point_tensors
 from ...shared.surface_splats import SurfaceAvatar
 from ...shared.tensor_files import read_safetensors
 from ..harmonics import importance, training_views
+from ..settings import Precision
 from .coder import CODEC, Coder, CoderInput, Content, visibility_classes, write_content
 from .layouts import (
     COLOURS,
@@ -63,7 +64,6 @@ from .layouts import (
     offsets,
     reduced,
 )
-from .precision import Precision
 
 CODEC_VERSION = 4
 """Codec version, increased when the same avatar and steps give different files."""

@@ -24,7 +24,7 @@ from ....bench.io.documents import checked, parse_json
 from ....bench.io.files import write_bytes
 from ...shared.avatar_files import COMPACT_FILE
 from ...shared.tensor_files import check_tensors, read_safetensors
-from .precision import Precision
+from ..settings import Precision
 
 KEY, DATA, VERSION = "compact", "data", 3
 CODEC = "codec"

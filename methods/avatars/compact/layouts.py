@@ -33,8 +33,8 @@ from ...ours.field import (
 from ...rgbavatar.model import SHAPES
 from ...shared.avatar_files import Subject
 from ...shared.surface_points import SubjectMesh, SurfacePoints, full_barycentric
+from ..settings import Precision
 from .coder import FINEST, Coder, read_content, scale_of, visibility_classes
-from .precision import Precision
 
 Tensors = dict[str, np.ndarray]
 Layout = Callable[[Coder, HeadAsset, Subject], Tensors]

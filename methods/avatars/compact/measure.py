@@ -21,9 +21,8 @@ from ....bench.specs import CommandResult, command
 from ...shared.avatar_files import COMPACT_FILE, read_shared_head
 from ...shared.optimisation import picture_ssim, psnr, squared_error
 from ..export import neutral_pose
+from ..settings import EXACT, CompactSettings
 from .codecs import DRIVING_FILE, parts_of, write_coded
-from .precision import EXACT
-from .settings import CompactSettings
 
 Quality = dict[str, float | None]
 """PSNR (dB) and SSIM against the ground truth, means over frames, None without one; and ``psnr_exact``, dB against the renders

@@ -42,8 +42,8 @@ from ...shared.rendering import USUAL, Cutoffs
 from ...shared.surface_points import SubjectMesh
 from ...shared.tensor_files import read_safetensors
 from ..compact.codecs import parts_of, write_coded
-from ..compact.precision import Precision
 from ..harmonics import contribution, training_views
+from ..settings import Precision
 
 STEPS = (1.0, 0.25, 0.5, 2.0, 4.0)
 """Factors of all quantisation steps."""

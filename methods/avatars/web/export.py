@@ -35,8 +35,8 @@ from ...splats import rasterize
 from ...splats.reference import rotation_matrices
 from ..export import neutral_pose, open_splats
 from ..harmonics import direction_of, orbit_camera
+from ..settings import ExportHtmlSettings
 from .bake import JOINTS, Moved, Slider, Source, WebAvatar, bake
-from .settings import ExportHtmlSettings
 
 FORMAT = 1
 LOWEST_LOG_SCALE = -14.0

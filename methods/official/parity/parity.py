@@ -12,7 +12,6 @@ from statistics import fmean, stdev
 from typing import Any, Literal
 
 import tyro
-from scipy.stats import t as student_t
 
 from ....bench.benchmarks import table as aligned
 from ....bench.condition import Condition, Named, label_of
@@ -37,10 +36,6 @@ from ....bench.specs import CommandResult, command
 from ...flashavatar.spec import FlashAvatarConfig
 from ...rgbavatar.spec import RGBAvatarConfig
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
-from ...shared.schedule import DensifySchedule, Timeline
-from ..flashavatar.method import SPLATS
-from ..method import TRAINING_LOG
-from ..rgbavatar.method import PLY_FILE
 
 WITHOUT_PERCEPTUAL_LOSS = 15_000
 """Iterations up to which the authors' code of FlashAvatar has no perceptual loss, which the native method never has."""
@@ -212,14 +207,16 @@ class Difference:
         D. Schuirmann, Journal of Pharmacokinetics and Biopharmaceutics 15, 1987. It is at most 5 % where the 90 % interval lies within
         the margin. Orders on one capture are treated as independent of each other.
         """
-        apart = [b - a for a, b in zip(self.native, self.official, strict=True)]
-        if len(apart) < 2:
+        from scipy.stats import t as student_t
+
+        differences = [b - a for a, b in zip(self.native, self.official, strict=True)]
+        if len(differences) < 2:
             return None
-        error = stdev(apart) / math.sqrt(len(apart))
+        error = stdev(differences) / math.sqrt(len(differences))
         distance = margin - abs(self.difference)
         if error == 0.0:
             return 0.0 if distance > 0 else 1.0
-        return float(student_t.sf(distance / error, len(apart) - 1))
+        return float(student_t.sf(distance / error, len(differences) - 1))
 
 
 @command("run parity", group="compare", writes="out", kinds=("captures",))
@@ -229,12 +226,12 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
     config = run_config(settings, out)
     check_executor(settings.execution, config.device)
     try:
-        found = resolve_cells(config)
-        check_settings(found)
+        methods = resolve_cells(config)
+        check_settings(methods)
     except InputError as error:
         raise _with_options(error, OFFICIAL[settings.method]) from error
-    native, official = (method.spec.name for method, _ in found)
-    condition = found[0][1].name
+    native, official = (method.spec.name for method, _ in methods)
+    condition = methods[0][1].name
     with log_to_file(out / "parity.log"):
         if settings.data is None:
             _make_capture(settings, out, progress)
@@ -264,8 +261,8 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
         "run": "run",
     }
     write_json(out / "parity.json", data)
-    apart = [d for d in differences if d.metric == "psnr" and abs(d.difference) > settings.tolerance]
-    return CommandResult(text, data, bool(differences) and not apart and not rows.failed)
+    too_far = any(d.metric == "psnr" and abs(d.difference) > settings.tolerance for d in differences)
+    return CommandResult(text, data, bool(differences) and not too_far and not rows.failed)
 
 
 def _with_options(error: InputError, official: str) -> InputError:
@@ -337,6 +334,8 @@ def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
     if native == "gbs":
         errors = {"correctives_variant": "official", "lower_teeth_variant": "official"}
         return {"min_sh_every": 1_000, "samples": samples, "teeth_samples": samples // 10, **errors}
+    from ...shared.schedule import DensifySchedule, Timeline
+
     timeline = Timeline(iterations, PAPER_ITERATIONS)
     schedule = DensifySchedule.of(SplatTraining(), timeline, white=True)
     assert schedule.reset_every is not None
@@ -351,7 +350,7 @@ def differences_of(
     rows: Rows, native: str, official: str, orders: Sequence[int], condition: str = ""
 ) -> list[Difference]:
     """Differences by task and metric, over the subjects and orders for which both have values under a condition."""
-    found = []
+    results = []
     for task in TASKS:
         for metric in METRICS:
             of_native, of_official = (
@@ -360,12 +359,11 @@ def differences_of(
             both = sorted(pair for pair in of_native.keys() & of_official.keys() if pair[1] in orders)
             if not both:
                 continue
-            apart = [of_official[pair] - of_native[pair] for pair in both]
+            differences = [of_official[pair] - of_native[pair] for pair in both]
             ours, theirs = (tuple(of[pair] for pair in both) for of in (of_native, of_official))
-            found.append(
-                Difference(task, metric, tuple(both), ours, theirs, fmean(apart), _half_width(apart))
-            )
-    return found
+            mean, half_width = fmean(differences), _half_width(differences)
+            results.append(Difference(task, metric, tuple(both), ours, theirs, mean, half_width))
+    return results
 
 
 def _means(rows: Rows, method: str, task: str, metric: str, condition: str) -> dict[tuple[str, int], float]:
@@ -383,6 +381,8 @@ def _means(rows: Rows, method: str, task: str, metric: str, condition: str) -> d
 def _half_width(values: Sequence[float]) -> float | None:
     if len(values) < 2:
         return None
+    from scipy.stats import t as student_t
+
     quantile = float(student_t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1))
     return quantile * stdev(values) / math.sqrt(len(values))
 
@@ -422,6 +422,10 @@ def _cells(run_folder: RunFolder, rows: Rows, method: str, orders: Sequence[int]
 
 def _splats(folder: Path) -> int | None:
     """Number of splats in an avatar's PLY file, or from FlashAvatar's log; None without both."""
+    from ..flashavatar.method import SPLATS
+    from ..method import TRAINING_LOG
+    from ..rgbavatar.method import PLY_FILE
+
     plys, log = [folder / name for name in ("point_cloud.ply", PLY_FILE)], folder / TRAINING_LOG
     path = next((ply for ply in plys if ply.is_file()), None)
     if path is None:

@@ -16,9 +16,8 @@ from headbench.datasets.ga import reader
 from headbench.datasets.ga.reader import read_capture
 from headbench.methods.avatars.export import export_ply, neutral_pose
 from headbench.methods.avatars.harmonics import fit_harmonics, sphere, visibility
-from headbench.methods.avatars.settings import ExportPlySettings
+from headbench.methods.avatars.settings import ExportHtmlSettings, ExportPlySettings
 from headbench.methods.avatars.web.export import export_page
-from headbench.methods.avatars.web.settings import ExportHtmlSettings
 from headbench.methods.ga.method import GA
 from headbench.methods.ga.spec import GAConfig
 from headbench.methods.gbs.method import GBS

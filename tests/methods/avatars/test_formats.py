@@ -15,9 +15,13 @@ from scipy.spatial import cKDTree
 from headbench.bench.engine.stored import avatar_folder, load_avatar
 from headbench.bench.errors import UnavailableError
 from headbench.methods.avatars.export import FORMATS, export_glb, export_ply, export_sog, neutral_pose
-from headbench.methods.avatars.settings import ExportGlbSettings, ExportPlySettings, ExportSogSettings
+from headbench.methods.avatars.settings import (
+    ExportGlbSettings,
+    ExportHtmlSettings,
+    ExportPlySettings,
+    ExportSogSettings,
+)
 from headbench.methods.avatars.web.export import export_page
-from headbench.methods.avatars.web.settings import ExportHtmlSettings
 from headbench.methods.shared.avatar_files import read_shared_head
 
 from ...world import finished

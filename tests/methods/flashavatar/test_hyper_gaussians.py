@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.methods.avatars.compact.codecs import parts_of, write_coded
-from headbench.methods.avatars.compact.precision import EXACT, Precision
+from headbench.methods.avatars.settings import EXACT, Precision
 from headbench.methods.flashavatar.method import FlashAvatar, FlashAvatarTraining
 from headbench.methods.flashavatar.model import (
     WIDTHS,

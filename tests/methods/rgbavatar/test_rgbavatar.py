@@ -11,7 +11,7 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.methods.avatars.compact.codecs import parts_of, write_coded
-from headbench.methods.avatars.compact.precision import EXACT
+from headbench.methods.avatars.settings import EXACT
 from headbench.methods.ops.planes import C0
 from headbench.methods.rgbavatar.method import RGBAvatar, RGBAvatarTraining
 from headbench.methods.rgbavatar.model import SHAPES, StoredShapes, blend_weights, blended, seen_colors

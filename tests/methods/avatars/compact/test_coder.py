@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from headbench.methods.avatars.compact.coder import Coder, CoderInput, pack, scale_of, visibility_classes
-from headbench.methods.avatars.compact.precision import EXACT, Precision
+from headbench.methods.avatars.settings import EXACT, Precision
 
 
 def both(values, code, precision=EXACT, **more):

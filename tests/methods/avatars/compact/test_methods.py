@@ -9,8 +9,8 @@ from headbench.bench.registry import get, resolve
 from headbench.methods.avatars.compact import layouts
 from headbench.methods.avatars.compact.codecs import parts_of, write_coded
 from headbench.methods.avatars.compact.coder import Content, read_content
-from headbench.methods.avatars.compact.precision import EXACT, Precision
 from headbench.methods.avatars.derived.recipes import STEPS, coded_name
+from headbench.methods.avatars.settings import EXACT, Precision
 from headbench.methods.flashavatar.method import FlashAvatar
 from headbench.methods.flashavatar.spec import FlashAvatarConfig
 from headbench.methods.ga.method import GA
