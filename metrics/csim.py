@@ -27,11 +27,7 @@ LENGTH = 512
 
 
 class ArcFace:
-    """The network in an ONNX file.
-
-    Raises `InputError` if the file is missing or not a network, or if the network has another input or output, or returns
-    numbers that are not finite.
-    """
+    """The network in an ONNX file."""
 
     def __init__(self, path: Path):
         expected = f"a network of ONNX that maps a picture of {SIDE}x{SIDE} pixels to {LENGTH} numbers"

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.specs import MetricSpec
-from .pairs import Mask, check_masks, check_pair
+from .psnr import Mask, check_masks, check_pair
 
 FLIP = MetricSpec(
     name="flip",

@@ -180,8 +180,6 @@ def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurem
     changes; ``warm_up_frames``; ``stationary`` (1 or 0); ``load``, the mean number of busy processes of the last minute. A run
     adds the number of threads and of cores used by other processes.
     Values of different machines are not comparable.
-
-    Raises `InputError` for a workload with equal consecutive entries.
     """
     return measure_speed(avatar, workload)
 

@@ -203,7 +203,7 @@ READ_IN_ONE_PLACE = {
     r"\btorch\.load\(": {
         "methods/official/flashavatar/method.py",  # programs for the authors' interpreters, run there
         "methods/official/gbs/method.py",
-        "metrics/torch_file.py",
+        "metrics/lpips_network.py",
     },
 }
 

@@ -41,7 +41,7 @@ from headbench.methods.shared.tensor_files import (
     save_checkpoint,
     write_ply,
 )
-from headbench.metrics.torch_file import read_weights
+from headbench.metrics.lpips_network import read_weights
 
 from .datasets.head.flame_files import legacy_pickle, write_flame
 from .datasets.head.toy import toy_head

@@ -34,7 +34,6 @@ from .web.bake import Source
 
 STANDARD = COLUMNS[:-1]
 """62 float32: position, zero normals, harmonics (the rest channel by channel), opacity logit, log-scales, wxyz."""
-
 OPACITY_MARGIN = 1e-6  # logits stay finite
 
 
@@ -242,10 +241,7 @@ SIZE = 400
 
 
 def open_splats(settings: AvatarOptions) -> tuple[StoredAvatar, SplatAvatar]:
-    """The stored avatar named by a command, and the loaded avatar.
-
-    Raises `InputError` as `open_avatar` and `StoredAvatar.load` do, and for an avatar without splats.
-    """
+    """The stored avatar named by a command, and the loaded avatar."""
     stored = open_avatar(Path(settings.avatar), settings.method)
     avatar = stored.load()
     if not isinstance(avatar, SplatAvatar):

@@ -54,10 +54,7 @@ class HeadSettings:
 
 @command("import ga", group="export", writes="out", kinds=("an avatar",))
 def import_avatar(settings: ImportGASettings, progress: Progress = no_progress) -> CommandResult:
-    """Import a GaussianAvatars PLY as an avatar of the method ga.
-
-    Raises `InputError` for invalid files and for an output folder that is not empty.
-    """
+    """Import a GaussianAvatars PLY as an avatar of the method ga."""
     ply, out = Path(settings.ply), Path(settings.out)
     ours = {AVATAR_FILE, LOCK_FILE, SUBJECT_FILE, HEAD_FILE, PLY_FILE, DRIVING_FILE}
     other = InputError(out, "", "a new or an empty folder", "one with files in it")

@@ -36,13 +36,12 @@ from ...datasets.head.procedural.model import procedural_head
 from ...datasets.steps.jaw_bases import jaw_quaternions
 from ..ga.method import GAAppearance, GAAvatar
 from ..ga.spec import GA, GAConfig
+from ..gbs.method import GBSTraining
 from ..gbs.spec import GBS, GBSConfig
-from ..gbs.training import GBSTraining
 from ..ours.appearance import OursAppearance
-from ..ours.config import OursConfig
 from ..ours.field import StoredField, initial_parameters, line_box, plane_box
 from ..ours.method import OursAvatar
-from ..ours.spec import OURS
+from ..ours.spec import OURS, OursConfig
 from ..shared import rendering
 from ..shared.avatar_files import Subject
 from ..shared.schedule import ShuffledEpochs, Timeline, numpy_generator, torch_generator

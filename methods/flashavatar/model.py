@@ -155,7 +155,7 @@ class TrainedSplats(SurfaceSplats[FlashAvatarConfig]):
 
     @classmethod
     def settings_of(cls, path: Path, text: str) -> FlashAvatarConfig:
-        """Settings with those of a `text`. Raises `InputError`, naming ``path``, for other text."""
+        """Settings with those of a `text`."""
         return settings_of_text(FlashAvatarConfig, RENDERING, text, path, cls.KEY, OPTIONAL)
 
     def checked(self, path: Path, head: HeadAsset, device: str) -> TrainedSplats:

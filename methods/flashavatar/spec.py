@@ -73,7 +73,6 @@ SHORT: dict[str, Any] = {
     "final_rate": 0.1,
 }
 """Settings of runs much shorter than published (docs/explanation/methods/flashavatar.md, "Presets")."""
-
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {"budget": {"iterations": 60}, **SHORT, "samples": 3_000},
     "quick": {"budget": {"iterations": 480}, **SHORT, "samples": 10_000},
@@ -90,7 +89,7 @@ FLASHAVATAR = MethodSpec(
     implementation="headbench.methods.flashavatar.method:FlashAvatar",
     config="headbench.methods.flashavatar.spec:FlashAvatarConfig",
     variants="headbench.methods.avatars.derived.recipes:flashavatar_variants",
-    needs="headbench.methods.shared.needs:splats",
+    needs="headbench.methods.shared.method:splats",
     ablations={"no-offsets": {"zero_output": True, "network_lr": 0.0}},
     mechanism=Mechanism("offset network", "offsets of the splats from the mesh", "no-offsets"),
     presets=PRESETS,

@@ -119,7 +119,7 @@ def read_ga_splats(path: Path, face_count: int, device: str) -> tuple[dict[str, 
 def checked_splats(
     path: Path, tensors: dict[str, Tensor], face_count: int, device: str
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Per-splat tensors and the binding. Raises `InputError` for tensors that do not fit each other or the mesh."""
+    """Per-splat tensors and the binding."""
     members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in SHAPES.items()}
     check_tensors(path, tensors, members | {BINDING: Member("i", ("N",))})
     check_sizes(path, tensors["log_scales"])
@@ -241,7 +241,7 @@ class GAAvatar(StoredSplatAvatar):
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GAAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
+        """Read an avatar from its folder."""
         head, coded = read_shared_head(folder), folder / COMPACT_FILE
         faces = len(head.faces)
         if coded.exists():

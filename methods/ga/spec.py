@@ -26,7 +26,6 @@ class GAConfig(HarmonicsTraining):
 
 SHORT: dict[str, Any] = {"sh_dc_lr": 0.02, "sh_rest_lr": 1e-3}
 """Settings of runs much shorter than published (docs/explanation/methods/ga.md, "Presets")."""
-
 GA = MethodSpec(
     name="ga",
     default=True,
@@ -35,7 +34,7 @@ GA = MethodSpec(
     summary="GaussianAvatars: splats with spherical harmonics rigged to the triangles of the tracked mesh.",
     implementation="headbench.methods.ga.method:GA",
     config="headbench.methods.ga.spec:GAConfig",
-    needs="headbench.methods.shared.needs:splats",
+    needs="headbench.methods.shared.method:splats",
     variants="headbench.methods.avatars.derived.recipes:ga_variants",
     ablations={"no-refined-tracking": {"refine_tracking": False}},
     mechanism=Mechanism("refined tracking", "displacement by the refined tracking", "no-refined-tracking"),

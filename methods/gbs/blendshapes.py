@@ -200,7 +200,7 @@ class Rig:
         self.turns = turns.flatten(0, 1)
 
     def arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
-        """Driving signal as tensors. Raises `InputError` for a pose of another head model."""
+        """Driving signal as tensors."""
         return self.mesh.arguments(poses)
 
     def coefficients(self, arguments: Mapping[str, Tensor]) -> Tensor:
@@ -335,7 +335,6 @@ def entries_of(mask: FloatArray, triangles: IntArray) -> tuple[IntArray, IntArra
 
 EXPRESSIONS = "expressions"
 """Key of the file's metadata: number of leading expressions that may have differences."""
-
 GEOMETRY = {"means": 3, "log_scales": 3, "quats": 4, "opacities": 1, "sh_dc": 3}
 """First columns of the (N, 14 + 3 R) float32 table of neutral splats; R harmonics above degree 0 by channel follow."""
 MEMBERS = {
@@ -390,7 +389,7 @@ def write_avatar(
 def stored_of(
     path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str], head: HeadAsset, device: str
 ) -> Stored:
-    """Check the content of a file that `write_avatar` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+    """Check the content of a file that `write_avatar` wrote."""
     said, expression_size = metadata.get(EXPRESSIONS, ""), head.expression_basis.shape[2]
     if not said.isdecimal() or len(said) > 9 or int(said) > expression_size:
         raise InputError(path, EXPRESSIONS, f"a number up to {expression_size}", repr(said[:20]))
@@ -412,7 +411,7 @@ def _rest(splats: Tensor) -> int:
 
 
 def _check(path: Path, tensors: Mapping[str, Tensor], expressions: int) -> IntArray:
-    """(N, K) whether an expression moves a splat. Raises `InputError` for the first tensor that does not fit."""
+    """(N, K) whether an expression moves a splat."""
     sizes = check_tensors(path, tensors, MEMBERS, {"bytes": -(-expressions // 8)})
     splats = tensors["splats"]
 

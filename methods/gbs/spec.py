@@ -53,7 +53,6 @@ class GBSConfig(HarmonicsTraining):
     difference_rotation_lr: float = 1e-4
     difference_opacity_lr: float = 5e-5
     """Learning rates of the differences; the same for harmonics of all degrees."""
-
     position_settles: int = 30_000
     """Iteration (published scale) at which the learning rate of positions has reached its final value."""
     teeth_densify_gradient: float = 2e-4
@@ -132,7 +131,7 @@ GBS = MethodSpec(
     implementation="headbench.methods.gbs.method:GBS",
     config="headbench.methods.gbs.spec:GBSConfig",
     variants="headbench.methods.avatars.derived.recipes:gbs_variants",
-    needs="headbench.methods.shared.needs:splats",
+    needs="headbench.methods.shared.method:splats",
     ablations={"no-differences": NO_DIFFERENCES},
     mechanism=Mechanism(
         "learnt differences", "position, opacity and colour by the learnt differences", "no-differences"

@@ -29,7 +29,6 @@ from .spec import GHAConfig
 
 POSE_SIZE = 6
 """Axis-angle and translation."""
-
 ANGLES = 9
 """Names of jaw and eyes in the expression code, after the expression."""
 
@@ -102,7 +101,7 @@ class Driver:
         self.expression_scale = expression_scale
 
     def arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
-        """Driving signal as tensors with a batch axis. Raises `InputError` for a pose of another head model."""
+        """Driving signal as tensors with a batch axis."""
         return self.model.pose_arguments(poses)
 
     @torch.no_grad()
@@ -268,7 +267,7 @@ class TrainingScene(NamedTuple):
 
 
 def training_scene(clip: Clip, config: GHAConfig, device: str, seed: int) -> TrainingScene:
-    """Prepare a clip. Raises `InputError` if its head model has no face region."""
+    """Prepare a clip."""
     subject = Subject.of(clip)
     identity = (clip.head, subject.shape, subject.static_offset)
     plain = Driver(*identity, np.zeros(3), 1.0, None, device)

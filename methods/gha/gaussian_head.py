@@ -21,13 +21,10 @@ from .spec import GHAConfig
 POINTS = {"points": 3, "log_scales": 3, "quats": 4, "opacities": 1}
 """Attributes of a Gaussian except its features, with columns: canonical position and scale, rotation, opacity
 logit."""
-
 LARGEST_LOG_SCALE = 2.0
 """Maximum size of a Gaussian in canonical units, also for expressions far outside the training range."""
-
 REACH = 2
 """Distance from a drawn pixel, in pixels of the feature image, that super-resolution may colour."""
-
 COVERED = 1e-3
 """Alpha above which a pixel of the feature image counts as drawn."""
 

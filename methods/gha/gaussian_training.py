@@ -27,10 +27,8 @@ from .spec import GHAConfig
 NEIGHBOURS = 3
 SMALLEST_SQUARED = 1e-7
 """Minimum squared distance to neighbours for initial scales."""
-
 ZOOM = (0.8, 1.25)
 """Range of the random rescaling before super-resolution."""
-
 ALMOST_ONE = 1 - 1e-6
 """Features of the mesh are clamped to this, so that their inverse tanh is finite."""
 

@@ -123,7 +123,6 @@ def uniform(
 
 ATTRIBUTES = (3, 4, 1)
 """Columns of log-scale, quaternion and opacity logit."""
-
 Influences = tuple[Influence, Influence]
 
 
@@ -229,10 +228,8 @@ def blended(
 
 OFFSET_CELLS = 0.3
 """Maximum offset of the grid's vertices in cells, before two tanh; published: 1/128 units in a grid of about 0.026."""
-
 CHUNK = 65_536
 """Vertices of the grid evaluated at once without gradients."""
-
 DISC_RADIUS, DISC_THICKNESS, DISC_OPACITY = 0.6, 0.1, 0.95
 """Standard deviation of a vertex's disc relative to the square root of its area, thickness relative to the radius, and
 opacity."""

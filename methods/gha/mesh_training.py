@@ -37,19 +37,15 @@ from .spec import GHAConfig
 
 TURNING = ("left_eyeball", "right_eyeball")
 """Excluded regions: eyeballs rotate under the lids, and one displacement field cannot represent both."""
-
 CODES, CODES_AT_ONCE = 512, 32
 """Number of stored expression codes, and of those in one draw."""
-
 POINTS_AT_ONCE = 64
 
 RATES = (5e-3, 5e-4)
 """First and last learning rate of the fit before the mesh phase."""
-
 SHARE_TRACKED, AROUND_TRACKED = 0.5, 0.3
 """Fraction of the codes that are drawn around those of training timesteps, and their standard deviation; the others
 are standard normal."""
-
 STILL = 0.02
 """Motion in canonical units (2 mm of the published 0.1 m) below which relative errors get no larger weight."""
 
@@ -141,7 +137,6 @@ def fitted(
 
 INNER_PARTS = ("teeth", "mouth_socket")
 """Regions behind the skin, which do not separate inside from outside."""
-
 FACING, FORWARD = ("left_eyeball", "right_eyeball", "eye_region"), 0.3
 """Regions of which only forward-facing parts bound the head (minimum component of the normals along z): eyeballs fill
 the lids' opening, but their backs, and the inner sides of lids, are behind the skin."""
@@ -182,17 +177,13 @@ def outer_vertices(vertices: FloatArray, faces: IntArray, regions: Mapping[str, 
 
 COLOR, SILHOUETTE, DISPLACEMENT, DISTANCE, SMOOTHNESS = 0.1, 0.1, 0.01, 0.1, 100.0
 """Published weights of the losses, except that of the landmarks, which is a setting."""
-
 MARGIN = 0.3
 """Margin of the grid around the neutral mesh, canonical units."""
-
 SPHERE_BATCH, SPHERE_RATES = 8_192, (1e-3, 1e-3)
 """Points in a step of the fit to a sphere, and its first and last learning rate, as published."""
-
 MESH_PLACES, MESH_BATCH, MESH_RATES = 100_000, 2_048, (5e-3, 5e-4)
 """Number of points with known distance to the tracked mesh, points in a step of the fit to it, and its learning
 rates."""
-
 NEAR, FAR = 0.1, 0.3
 """Canonical units: distance of most of those points from the mesh, and their maximum distance."""
 

@@ -97,7 +97,7 @@ class GHAAvatar:
 
     @classmethod
     def read(cls, folder: Path, device: str) -> GHAAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
+        """Read an avatar from its folder."""
         content_of, coded = partial(avatar_of, device=device), partial(read_coded, layout=networks)
         files, shared, subject, (head, tensors) = read_stored(folder, AVATAR_FILE, content_of, coded)
         driver = Driver(
@@ -114,7 +114,7 @@ class GHAAvatar:
 
     @torch.no_grad()
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """Render one frame. Raises `InputError` where the pose is of another head model.
+        """Render one frame.
 
         Super-resolution only produces the training background; the difference to the requested one is added where it is visible
         behind the splats.
@@ -187,7 +187,6 @@ class GHAAvatar:
 
 CONFIG = "config"
 """Key of the file's metadata: the settings of rendering, as JSON."""
-
 RENDERING = (
     "unit",
     "near_squared",
@@ -226,10 +225,7 @@ def write_avatar(path: Path, config: GHAConfig, tensors: Mapping[str, Tensor]) -
 def avatar_of(
     path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str], shared: HeadAsset, device: str
 ) -> tuple[GaussianHead, dict[str, Tensor]]:
-    """The networks, and their tensors and those of the points, of a file that `write_avatar` wrote.
-
-    Raises `InputError` if a tensor is missing, does not fit the settings, or is not finite float32.
-    """
+    """The networks, and their tensors and those of the points, of a file that `write_avatar` wrote."""
     size = code_size(shared)
     config = settings_of_text(GHAConfig, RENDERING, metadata.get(CONFIG, ""), path, CONFIG)
     head = GaussianHead.of(config, size)
@@ -255,7 +251,7 @@ def _shapes(head: GaussianHead, expression_size: int) -> dict[str, tuple[int | N
 def _checked(
     path: Path, tensors: dict[str, Tensor], head: GaussianHead, expression_size: int, device: str
 ) -> dict[str, Tensor]:
-    """The stored tensors in the form that the avatar uses. Raises `InputError` for the first inconsistent one."""
+    """The stored tensors in the form that the avatar uses."""
     shapes = _shapes(head, expression_size)
     members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in shapes.items()}
     # Without bounds of the code, these are float32's largest numbers.

@@ -52,7 +52,6 @@ class GHAConfig:
     expression_attribute_hidden: tuple[int, ...] = (256, 256, 256)
     pose_attribute_hidden: tuple[int, ...] = (128, 128)
     """Widths of the networks' hidden layers."""
-
     sr_widths: tuple[int, ...] = (128, 64, 32)
     """Widths of the super-resolution network's blocks. The first works at the splatted size, each further one at twice the size
     of the one before: their number decides how much smaller than the image splats are rendered."""
@@ -192,7 +191,6 @@ SHORT: dict[str, Any] = {
     "augment": False,
 }
 """Settings of the short presets, which scale with the capture, for CPUs (docs/explanation/methods/gha.md)."""
-
 NO_EXPRESSION = {"near_squared": 0.0, "far_squared": 1e-12, "motion_steps": 0, "motion_weight": 0.0}
 """Every point, and not only those far from the landmarks, depends on the head's pose alone."""
 SHORT_PRESETS: dict[str, dict[str, Any]] = {
@@ -224,7 +222,7 @@ GHA = MethodSpec(
     implementation="headbench.methods.gha.method:GHA",
     config="headbench.methods.gha.spec:GHAConfig",
     variants="headbench.methods.avatars.derived.recipes:gha_variants",
-    needs="headbench.methods.shared.needs:splats",
+    needs="headbench.methods.shared.method:splats",
     ablations={"no-expression": NO_EXPRESSION},
     mechanism=Mechanism(
         "expression networks", "position, opacity and colour by the expression", "no-expression"

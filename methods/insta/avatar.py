@@ -67,7 +67,7 @@ class InstaAvatar:
 
     @classmethod
     def read(cls, folder: Path, device: str) -> InstaAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
+        """Read an avatar from its folder."""
         head, coded = read_shared_head(folder), folder / COMPACT_FILE
         if coded.exists():
             files, (subject, tensors, text) = [coded], read_coded(coded, head, grid)
@@ -90,7 +90,7 @@ class InstaAvatar:
 
     @torch.no_grad()
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """Render one frame. Raises `InputError` where the pose is of another head model."""
+        """Render one frame."""
         surface = self._posed(pose)
         rgb = np.empty((camera.height, camera.width, 3), np.float32)
         rgb[:] = np.asarray([float(channel) for channel in background], np.float32).clip(0, 1)
@@ -160,7 +160,7 @@ TABLE = "table"
 
 
 def read_settings(path: Path) -> InstaConfig:
-    """Read settings from JSON. Raises `InputError` for settings that are unknown or out of range."""
+    """Read settings from JSON."""
     return _settings(read_json(path), path)
 
 
@@ -188,10 +188,7 @@ def field_of(
     size: tuple[int, ...],
     device: str,
 ) -> tuple[dict[str, Tensor], np.ndarray]:
-    """Float32 parameters, and flat indices of occupied cells, of the arrays of a file.
-
-    Raises `InputError` for an array that is missing, not finite or of another shape or type.
-    """
+    """Float32 parameters, and flat indices of occupied cells, of the arrays of a file."""
     shapes, cells = architecture.shapes(), math.prod(size)
     members = {name: Member("f", shape) for name, shape in shapes.items()}
     check_arrays(path, arrays, {**members, OCCUPIED: Member("u", (-(-cells // 8),), dtype="u1")})

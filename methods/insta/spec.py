@@ -162,7 +162,6 @@ SHORT: dict[str, Any] = {
     "final_rate": 0.05,
 }
 """Settings for a few minutes on two cores (docs/explanation/methods/insta.md, "Presets")."""
-
 INSTA = MethodSpec(
     name="insta",
     demo=True,
@@ -172,7 +171,7 @@ INSTA = MethodSpec(
     config="headbench.methods.insta.spec:InstaConfig",
     devices=("cpu",),
     variants="headbench.methods.avatars.derived.recipes:insta_variants",
-    needs="headbench.methods.shared.needs:insta",
+    needs="headbench.methods.shared.method:insta",
     ablations={"no-condition": {"conditions": 0}},
     mechanism=Mechanism(
         "expression condition",

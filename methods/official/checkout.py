@@ -23,7 +23,6 @@ from .spec import INSTAOfficialConfig, OfficialConfig
 SHORTEST_COMMIT = 7
 PROBE_S = 300.0
 """Time limit for the interpreter to import the required modules, seconds; the first import reads them from disk."""
-
 SHIM = "headbench.methods.official.shim.cpu"
 SHIMMED = (
     *("diff_gaussian_rasterization", "simple_knn", "nvdiffrast"),
@@ -31,7 +30,6 @@ SHIMMED = (
     *("lpips", "yacs", "loguru", "skimage"),
 )
 """Packages and modules that the shim replaces."""
-
 _PROBE = """
 import importlib, json, sys
 found = {"python": sys.version.split()[0], "missing": {}, "failed": ""}
@@ -90,7 +88,7 @@ class Checkout:
     """Commit, modified files and versions, for the avatar's record."""
 
     def constant(self, file: str, pattern: str, what: str) -> str:
-        """First group of ``pattern`` in a source file. Raises `InputError` without a match."""
+        """First group of ``pattern`` in a source file."""
         return find_constant(self.folder, file, pattern, what)
 
 

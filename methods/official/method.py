@@ -128,7 +128,7 @@ class OfficialMethod(ABC, Generic[Config]):
 
     @abstractmethod
     def read_back(self, frame: Listed, path: Path, background: Sequence[float], work: Workplace) -> Frame:
-        """A render for its camera. Raises `InputError` for a render of another size or frame."""
+        """A render for its camera."""
 
     def differences(self, clip: Clip, seed: int) -> list[str]:
         """Differences from the published code, for the record."""
@@ -401,7 +401,7 @@ def _read_back(
     work: Workplace,
     ended: ProgramEnd,
 ) -> Iterator[tuple[FrameKey, Frame]]:
-    """Renders by the names of the index. Raises `InputError` unless these and no others exist."""
+    """Renders by the names of the index."""
     renders = work.model / method.render_folder
     index = {name: FrameKey(*key) for name, key in read_json(work.root / INDEX).items()}
     found = {path.name for path in renders.glob(method.render_files)}

@@ -47,7 +47,6 @@ class OfficialConfig:
     the same image in each iteration."""
     time_limit_hours: float | None = None
     """Time after which one of their programs is ended and its cell fails; None for no limit."""
-
     places: ClassVar[tuple[str, ...]] = ("checkout", "python", "time_limit_hours")
 
     def __post_init__(self) -> None:
@@ -115,7 +114,6 @@ class INSTAOfficialConfig(OfficialConfig):
     --nv insta.sif /path/INSTA/build/rta``."""
     images_on_gpu: int = 1700
     """Number of training images in the GPU's memory; if there are more, their code loads others every 1,500 iterations."""
-
     places: ClassVar[tuple[str, ...]] = (*OfficialConfig.places, "program")
 
     def __post_init__(self) -> None:
@@ -220,7 +218,7 @@ GA_OFFICIAL = MethodSpec(
     summary="GaussianAvatars by its authors' code, in your checkout and environment; needs CUDA or device=cpu-shim.",
     implementation="headbench.methods.official.ga.method:GAOfficial",
     config="headbench.methods.official.spec:GAOfficialConfig",
-    renders="headbench.methods.official.renders:gaussian_avatars",
+    renders="headbench.methods.official.workplace:gaussian_avatars",
     presets={
         name: preset | {"arguments": _short_rates(SHORT_SPLATS, SHORT)}
         for name, preset in _lengths(smoke=60, demo=2_000, fast=4_000).items()
@@ -234,7 +232,7 @@ TGA_OFFICIAL = MethodSpec(
     summary="The method ours by its authors' code, in your checkout and environment; needs CUDA or device=cpu-shim.",
     implementation="headbench.methods.official.tga.method:TGAOfficial",
     config="headbench.methods.official.spec:TGAOfficialConfig",
-    renders="headbench.methods.official.renders:gaussian_avatars",
+    renders="headbench.methods.official.workplace:gaussian_avatars",
     # Their feature lines start at a fixed iteration, so shorter runs do not train the method.
     presets=_lengths(paper=PAPER_ITERATIONS),
     **_paper_of(OURS),
@@ -242,13 +240,12 @@ TGA_OFFICIAL = MethodSpec(
 
 _SAMPLES = "--init_face_point_number"
 """Option of GaussianBlendshapes for the initial number of splats; its script has fewer options for learning rates."""
-
 GBS_OFFICIAL = MethodSpec(
     name="gbs-official",
     summary="GaussianBlendshapes by its authors' code, in your checkout and environment; needs CUDA or device=cpu-shim.",
     implementation="headbench.methods.official.gbs.method:GBSOfficial",
     config="headbench.methods.official.spec:GBSOfficialConfig",
-    renders="headbench.methods.official.renders:gaussian_blendshapes",
+    renders="headbench.methods.official.workplace:gaussian_blendshapes",
     presets=_lengths_of(GBS)
     | {
         name: {
@@ -280,7 +277,7 @@ INSTA_OFFICIAL = MethodSpec(
     summary="INSTA by its authors' code, built in your checkout; needs CUDA.",
     implementation="headbench.methods.official.insta.method:INSTAOfficial",
     config="headbench.methods.official.spec:INSTAOfficialConfig",
-    renders="headbench.methods.official.renders:insta",
+    renders="headbench.methods.official.workplace:insta",
     # The authors' settings have no schedule to shorten.
     presets=_lengths_of(INSTA),
     monocular=True,

@@ -99,7 +99,7 @@ def check_masks(clip: Clip) -> None:
 
 
 def coverage_of(clip: Clip, key: FrameKey) -> ByteArray:
-    """(H, W) mask of a frame. Raises `InputError` if it is missing."""
+    """(H, W) mask of a frame."""
     mask = clip.mask(key)
     if mask is None:
         expected = "a mask; the code trains only on the head, selected by the fourth channel of its images"

@@ -19,7 +19,6 @@ from ..shared.rendering import View
 from ..shared.schedule import Timeline, log_linear, torch_generator
 from ..shared.splat_training import ShadedSplats, Start, one_per_triangle
 from ..shared.surface_points import BoundedCache, SubjectMesh, centroid_displacements
-from .config import RAMP_FROM, OursConfig
 from .field import (
     COLOR_NETWORK,
     FIRST_LAYER,
@@ -37,6 +36,7 @@ from .field import (
     offset_layers,
     plane_box,
 )
+from .spec import RAMP_FROM, OursConfig
 
 FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
 

@@ -32,17 +32,15 @@ from ..ops.planes import (
 )
 from ..ops.splats import TriangleFrames, points_on, turns_between
 from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, read_safetensors, write_tensors
-from .config import Dynamic, OursConfig
+from .spec import Dynamic, OursConfig
 
 WIDTHS: Mapping[Dynamic, int] = {"opacity": 1, "position": 3, "rotation": 4, "scale": 3, "color": 3}
 """Number of values per splat of each attribute that may change."""
-
 PLANES = tuple(f"plane_{pair}" for pair, _, _ in PAIRS)
 FIRST_LAYER = "color_weight_0"
 LAST_LAYER = "color_weight_1"
 COLOR_NETWORK = (*PLANES, FIRST_LAYER, LAST_LAYER)
 """Colour as a function of position and direction: planes and the weights of both layers."""
-
 FIELDS = {"opacity": "logits", "position": "means", "rotation": "quats", "scale": "log_scales"}
 """Attributes of `LocalSplats` that offsets are added to."""
 
@@ -240,13 +238,10 @@ def _initial_planes(config: OursConfig, generator: torch.Generator) -> dict[str,
 FIELD_FILE = "avatar.safetensors"
 DYNAMIC = "dynamic"
 """Key of the file's metadata: attributes that the lines change, in the order of the offset network's outputs."""
-
 RESIDUAL = "color_residual"
 """The (N, 3) separate colours of splats, added to those of the planes."""
-
 PER_SPLAT = ("splats", "sh_dc", "sh_rest", RESIDUAL)
 """Tensors with a row for each splat."""
-
 SPLAT_WIDTHS = {"means": 3, "opacities": 1, "log_scales": 3, "quats": 4, "binding": 1}
 """Columns of the (N, 12) float32 splat table, 48 bytes each; the triangle is exact up to 2^24."""
 
@@ -291,17 +286,14 @@ def save_field(path: Path, field: StoredField) -> None:
 
 
 def read_field(path: Path, head: HeadAsset, device: str) -> StoredField:
-    """Read and check what `save_field` wrote. Raises `InputError` if a tensor is missing or does not fit."""
+    """Read and check what `save_field` wrote."""
     return field_of(path, *read_safetensors(path), head, device)
 
 
 def field_of(
     path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str], head: HeadAsset, device: str
 ) -> StoredField:
-    """Check the tensors and metadata of a file.
-
-    Raises `InputError` if a tensor is missing, is not finite float32 or does not fit the others.
-    """
+    """Check the tensors and metadata of a file."""
     names = metadata.get(DYNAMIC, "opacity")
     given = names.split(",")
     if len(set(given)) != len(given) or not set(given) <= set(WIDTHS):

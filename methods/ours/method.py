@@ -53,7 +53,6 @@ from ..shared.schedule import Sampler, ShuffledEpochs, Weighted, balanced_weight
 from ..shared.splat_training import BoundTraining
 from ..shared.surface_points import SubjectMesh, centroid_displacements
 from .appearance import OursAppearance, driving_coefficients, outer_layers_start, penalty_weights
-from .config import OursConfig, Planned
 from .field import (
     FIELD_FILE,
     FIRST_LAYER,
@@ -77,7 +76,7 @@ from .field import (
     splat_columns,
     write_field,
 )
-from .spec import OURS, OURS_PLUS
+from .spec import OURS, OURS_PLUS, OursConfig, Planned
 
 LINE_SAMPLES_PER_PIXEL = 0.5
 MINIMUM_PLANE, MINIMUM_LINE = 8, 4
@@ -376,7 +375,7 @@ class OursAvatar(StoredSplatAvatar):
 
     @classmethod
     def read(cls, folder: Path, device: str) -> OursAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
+        """Read an avatar from its folder."""
         content_of, coded = partial(field_of, device=device), partial(read_coded, layout=field_layout)
         files, head, subject, field = read_stored(folder, FIELD_FILE, content_of, coded)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)

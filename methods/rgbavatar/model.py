@@ -78,7 +78,7 @@ class StoredShapes(SurfaceSplats[RGBAvatarConfig]):
 
     @classmethod
     def settings_of(cls, path: Path, text: str) -> RGBAvatarConfig:
-        """Settings of a `text`. Raises `InputError`, naming ``path``, for other text."""
+        """Settings of a `text`."""
         inputs, _, variant = text.partition(FRAMES)
         values = {cls.KEY: inputs.split(","), "frame_variant": variant or "orthonormal"}
         return build(RGBAvatarConfig, values, str(path))

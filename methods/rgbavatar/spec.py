@@ -140,7 +140,6 @@ SHORT: dict[str, Any] = {
     "color_every": 10,
 }
 """Settings of runs much shorter than published (docs/explanation/methods/rgbavatar.md, "Presets")."""
-
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {"budget": {"iterations": 60}, **SHORT, "samples": 3_000},
     "quick": {"budget": {"iterations": 400}, **SHORT, "samples": 10_000},
@@ -158,7 +157,7 @@ RGBAVATAR = MethodSpec(
     implementation="headbench.methods.rgbavatar.method:RGBAvatar",
     config="headbench.methods.rgbavatar.spec:RGBAvatarConfig",
     variants="headbench.methods.avatars.derived.recipes:rgbavatar_variants",
-    needs="headbench.methods.shared.needs:splats",
+    needs="headbench.methods.shared.method:splats",
     ablations={"no-blendshapes": dict.fromkeys(("position_share", "rotation_share", "color_share"), 0.0)},
     mechanism=Mechanism(
         "learnt blendshapes", "position and colour by the learnt blendshapes", "no-blendshapes"

@@ -87,7 +87,7 @@ def write_subject(path: Path, subject: Subject) -> None:
 
 
 def read_subject(path: Path, head: HeadAsset) -> Subject:
-    """Read what `write_subject` wrote. Raises `InputError` if it does not fit the head model."""
+    """Read what `write_subject` wrote."""
     members = {
         "name": TEXT,
         "head_model": TEXT,

@@ -171,7 +171,6 @@ class Capacity:
 PAPER_ITERATIONS = 600_000
 GPU_ITERATIONS = 60_000
 """Preset "gpu": "paper" with these changes; an estimated hour per subject on one GPU."""
-
 SHORT_SPLATS: Mapping[str, Any] = {
     "initial_opacity": 0.5,
     "final_rate": 0.1,

@@ -269,7 +269,7 @@ class StoredSplatAvatar:
         return draw_splats(placed.world, placed.opacities, colors, view, end_stage, self._cutoffs)
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """Render one frame. Raises `InputError` where the pose is of another head model."""
+        """Render one frame."""
         return read_back(self.draw(camera, pose, background))
 
     def read_back(self, drawn: Drawn) -> Frame:

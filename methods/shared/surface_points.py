@@ -54,7 +54,7 @@ class SubjectMesh:
         return self._canonical[0]
 
     def arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
-        """Driving signal as tensors with a batch axis. Raises `InputError` for a pose of another head model."""
+        """Driving signal as tensors with a batch axis."""
         return self.model.pose_arguments(poses)
 
     def posed(self, arguments: Mapping[str, Tensor]) -> Tensor:
@@ -72,7 +72,7 @@ class SubjectMesh:
 
     @torch.no_grad()
     def drive(self, pose: HeadPose) -> TriangleFrames:
-        """Triangle frames of a pose in the world. Raises `InputError` for another head model's pose."""
+        """Triangle frames of a pose in the world."""
         return self.frames(self.posed(self.arguments([pose])))
 
 

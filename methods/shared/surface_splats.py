@@ -127,7 +127,6 @@ class SurfaceSplats(Generic[Settings]):
     """Surface point of each of the N splats."""
     settings: Settings
     """Further values that rendering needs."""
-
     KEY: ClassVar[str]
     """Key of the settings in the file's metadata."""
 
@@ -148,11 +147,11 @@ class SurfaceSplats(Generic[Settings]):
 
     @classmethod
     def settings_of(cls, path: Path, text: str) -> Settings:
-        """Settings of a `text`. Raises `InputError`, naming ``path``, for other text."""
+        """Settings of a `text`."""
         raise NotImplementedError
 
     def checked(self, path: Path, head: HeadAsset, device: str) -> Self:
-        """The same on a device. Raises `InputError`, naming ``path``, where the tensors do not fit each other or the head."""
+        """The same on a device."""
         members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in self.shapes(head).items()}
         check_tensors(path, self.tensors, members, {"N": len(self.points.triangles)})
         check_sizes(path, self.tensors["log_scales"])
@@ -166,7 +165,7 @@ class SurfaceSplats(Generic[Settings]):
     def of(
         cls, path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str], head: HeadAsset, device: str
     ) -> Self:
-        """Check the content of a file that `write` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+        """Check the content of a file that `write` wrote."""
         settings = cls.settings_of(path, metadata.get(cls.KEY, ""))
         points = take_points(path, tensors, len(head.faces))
         return cls(tensors, points, settings).checked(path, head, device)
@@ -194,7 +193,7 @@ class SurfaceAvatar(StoredSplatAvatar, Generic[Stored]):
 
     @classmethod
     def read(cls, folder: Path, device: str) -> Self:
-        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
+        """Read an avatar from its folder."""
         content_of = partial(cls.stored_class.of, device=device)
         return cls(*read_stored(folder, AVATAR_FILE, content_of, cls.read_coded), device)
 

@@ -86,7 +86,7 @@ def read_ply(path: Path, names: tuple[str, ...]) -> FloatArray:
 
 
 def read_names(path: Path) -> tuple[str, ...]:
-    """The columns of a PLY file from its header. Raises `InputError` as `read_ply` does."""
+    """The columns of a PLY file from its header."""
     with open_regular(path, EXPECTED) as stream:
         return tuple(_header(path, stream.read(HEADER_LIMIT))[1])
 

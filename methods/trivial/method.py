@@ -80,7 +80,7 @@ class TexturedMeshAvatar:
         return [self._folder / TEXTURE_FILE, self._folder / SUBJECT_FILE]
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """The mesh before the background. Raises `InputError` for a pose of another head model."""
+        """The mesh before the background."""
         (vertices,) = self._mesh.meshes([pose])
         fine = camera.resized(SUPERSAMPLING * camera.width, SUPERSAMPLING * camera.height)
         fragments = rasterize_mesh(vertices, self._faces, fine)
@@ -245,7 +245,7 @@ class _ImageAvatar:
         self._head_model, self._background = str(arrays["head_model"]), arrays["background"]
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """The image at the camera's size. Raises `InputError` for a pose of another head model."""
+        """The image at the camera's size."""
         if pose.head_model != self._head_model:
             raise InputError("pose", "head_model", repr(self._head_model), repr(pose.head_model))
         rgba = resize(self._image(camera, pose), camera.width, camera.height)

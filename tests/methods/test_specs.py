@@ -20,8 +20,7 @@ from headbench.methods.ga.spec import GA, GAConfig
 from headbench.methods.gbs.spec import GBS, GBSConfig
 from headbench.methods.gha.spec import GHA, GHAConfig
 from headbench.methods.insta.spec import INSTA, InstaConfig
-from headbench.methods.ours.config import Lines, OursConfig, OuterLayers, Penalty, Planes, PlannedCapacity
-from headbench.methods.ours.spec import OURS
+from headbench.methods.ours.spec import OURS, Lines, OursConfig, OuterLayers, Penalty, Planes, PlannedCapacity
 from headbench.methods.rgbavatar.spec import RGBAVATAR, RGBAvatarConfig
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, Timeline

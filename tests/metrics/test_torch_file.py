@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from headbench.bench.errors import InputError
-from headbench.metrics.torch_file import read_weights
+from headbench.metrics.lpips_network import read_weights
 
 BASE = torch.arange(24.0).reshape(2, 3, 4)
 STATE = {

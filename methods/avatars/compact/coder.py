@@ -75,7 +75,7 @@ def write_content(path: Path, content: Content) -> dict[str, int]:
 
 
 def read_content(path: Path) -> Content:
-    """Read what `write_content` wrote. Raises `InputError` for anything else, before it takes more memory."""
+    """Read what `write_content` wrote."""
     tensors, metadata = read_safetensors(path)
     header = _header(path, metadata)
     check_tensors(path, tensors, {DATA: Member("u", (None,), dtype="u1")})
@@ -92,7 +92,7 @@ def read_content(path: Path) -> Content:
 
 
 def codec_of(files: Sequence[Path]) -> str:
-    """Codec of an avatar's files; "" for those of a training. Raises `InputError` for a damaged coded file."""
+    """Codec of an avatar's files; "" for those of a training."""
     path = next((path for path in files if path.name == COMPACT_FILE), None)
     return "" if path is None else _header(path, read_safetensors(path)[1]).text.get(CODEC, "")
 

@@ -52,10 +52,7 @@ DIFFERENCE_STEP = 0.5  # of that of the attribute: in a pose, several difference
 def read_coded(
     path: Path, head: HeadAsset, layout: Layout
 ) -> tuple[Subject, dict[str, Tensor], Mapping[str, str]]:
-    """Subject, tensors of the exact file, and texts of a coded file.
-
-    Raises `InputError` for a damaged file and one of another layout; the values remain to be checked.
-    """
+    """Subject, tensors of the exact file, and texts of a coded file."""
     content = read_content(path)
     version = content.text.get("head_model")
     if version != head.version:

@@ -91,7 +91,6 @@ EYELID_FILES = (Path("flame/blendshapes/l_eyelid.npy"), Path("flame/blendshapes/
 FULL = 255
 TURNS_AND_LIDS = 20
 """Inputs of their network for jaw, eyes and eyelids."""
-
 TEXEL_SIDE = 0.5
 """Sides of a triangle of `chart_of_points`, texels: no other texel's centre lies in it."""
 SMALLEST_WEIGHT = 1e-4

@@ -205,7 +205,7 @@ class OfficialHead:
 
     @classmethod
     def of(cls, head: HeadAsset, checkout: Path) -> OfficialHead:
-        """Convert a clip's head model for their code. Raises `InputError` if that is impossible."""
+        """Convert a clip's head model for their code."""
         own = cls.numbered(head)
         if _same_faces(own.faces, checkout / TEMPLATE_FILE):
             return own  # FLAME's own topology: their indices are valid
@@ -213,7 +213,7 @@ class OfficialHead:
 
     @classmethod
     def numbered(cls, head: HeadAsset) -> OfficialHead:
-        """A head with its own indices, without teeth. Raises `InputError` for bases and joints of other sizes."""
+        """A head with its own indices, without teeth."""
         where = f"head model {head.version!r}"
         for name, size, most in (
             ("identity", head.shape_basis.shape[2], FLAME_IDENTITY_SIZE),

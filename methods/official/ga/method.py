@@ -122,7 +122,7 @@ def check_mark(image: ByteArray, path: Path, number: int) -> None:
 
 
 def read_window(frame: Listed, path: Path) -> ByteArray:
-    """A render at the size of its camera. Raises `InputError` for a render of another size than its window."""
+    """A render at the size of its camera."""
     window = around(frame.camera)
     return window.uncut(read_sized(path, frame, window.camera.width, window.camera.height), frame.camera)
 

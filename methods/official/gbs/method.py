@@ -217,7 +217,6 @@ for path in sys.argv[1:]:
     torch.save((kept, iteration), path)
 """
 """Removes the optimiser's state, two thirds of their size, from checkpoints, since their renderer ignores it."""
-
 WITHOUT_FIX = "2952da7d246e5790140dbb477d1468214564f092"
 """The commit that the adapter was written for, from before the authors' fix of June 2025."""
 

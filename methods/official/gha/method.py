@@ -65,7 +65,7 @@ class GHATracking:
 
     @classmethod
     def of(cls, head: HeadAsset, subject: Subject) -> GHATracking:
-        """Landmarks of a subject. Raises `InputError` for a head model without face or lips."""
+        """Landmarks of a subject."""
         if not len(head.regions.get("lips", ())):
             known = ", ".join(sorted(head.regions)) or "no regions"
             raise InputError(f"head model {head.version!r}", "regions", "a region 'lips'", known)
@@ -185,7 +185,7 @@ def training_side(clip: Clip) -> int:
 
 
 def whole_timesteps(clip: Clip) -> dict[int, dict[str, FrameKey]]:
-    """Training frames by timestep and camera. Raises `InputError` for a timestep that some camera lacks."""
+    """Training frames by timestep and camera."""
     names = list(cameras_of(clip, "train"))
     frames: dict[int, dict[str, FrameKey]] = {}
     for key in sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera)):

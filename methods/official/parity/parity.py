@@ -51,59 +51,42 @@ class ParitySettings(ExecutionOptions):
 
     method: tyro.conf.Positional[Literal["flashavatar", "ga", "gbs", "ours", "rgbavatar"]]
     """The native method. The authors' code of method ours is TensorialGaussianAvatar (`tga-official`)."""
-
     checkout: str
     """Folder of a checkout of the authors' repository; it is not changed."""
-
     out: str
     """Folder to write."""
-
     data: str | None = None
     """Capture to train on, of one subject or several. Default: a synthetic one is made in OUT/capture, of --subjects heads, SIZE, with
     --cameras and --timesteps."""
-
     head: str | None = None
     """Head model of captures that do not contain one: FLAME pickle or npz."""
-
     iterations: int = 1_000
     """Length of each training; with rgbavatar, steps of ten images."""
-
     orders: int = 5
     """Number of orders of the images, each with one training of either method. A single order on one capture gives no interval."""
-
     device: Literal["cuda", "cpu-shim"] = "cuda"
     """Device of the authors' code: CUDA, or headbench's CPU renderer instead of its rasteriser
     (docs/explanation/methods/official.md), which shows differences of training and head model, not of the rasterisers."""
-
     python: str = ""
     """Interpreter for the authors' code, as settings.ga-official.python of `headbench run`. Default with cpu-shim: this one."""
-
     commit: str | None = None
     """Expected commit; default: the one that the adapter was written for; "" accepts any."""
-
     frames: int | None = None
     """Held-out frames scored for each task, evenly spread; default: all."""
-
     tolerance: float = 0.3
     """Difference of PSNR, in decibels, within which the two count as equivalent; also the limit of the mean difference."""
-
     samples: int | None = None
     """Number of splats on the head. gbs: initial number, 5,000 by default; published: 50,000, whose differences for each expression
     take gigabytes. flashavatar: 13,500 by default, as published; others only on heads of another topology than FLAME's.
     rgbavatar: the same, 60,000 by default."""
-
     subjects: int = 2
     """Heads of the synthetic capture; both methods are trained on each with every order."""
-
     size: str = "96x136"
     """Width x height of the synthetic capture's images in pixels."""
-
     cameras: int = 8
     """Views of the synthetic capture, including the held-out one."""
-
     timesteps: int = 24
     """Timesteps of the synthetic capture."""
-
     dependent = (
         DependentOptions(("subjects", "size", "cameras", "timesteps"), "data", False),
         DependentOptions(("samples",), "method", ("flashavatar", "gbs", "rgbavatar")),

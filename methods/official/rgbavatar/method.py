@@ -56,7 +56,7 @@ def has_their_topology(head: HeadAsset, checkout: Checkout) -> bool:
 
 
 def chart_of(head: HeadAsset) -> FloatArray:
-    """(F, 3, 2) float64 texture coordinates of a head. Raises `InputError` if it has none."""
+    """(F, 3, 2) float64 texture coordinates of a head."""
     uv = getattr(head, "uv", None)
     if uv is None:
         remedy = (

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.methods.gbs.spec import GBSConfig
-from headbench.methods.gbs.training import (
+from headbench.methods.gbs.method import (
     MouthCylinder,
     mouth_cylinder,
     padded_offset,
     rows_of_teeth,
     with_mouth,
 )
+from headbench.methods.gbs.spec import GBSConfig
 
 
 def test_distances_to_the_cylinder_are_those_of_its_sides():

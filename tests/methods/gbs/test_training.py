@@ -9,16 +9,16 @@ from skimage.metrics import structural_similarity
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.methods.gbs.blendshapes import PointMotions, apply_pose, difference_widths
-from headbench.methods.gbs.method import GBS
-from headbench.methods.gbs.spec import BlendshapeTraining, GBSConfig
-from headbench.methods.gbs.training import (
+from headbench.methods.gbs.method import (
     DIFFERENCES,
+    GBS,
     GBSTraining,
     mouth_cylinder,
     padded_offset,
     sample_count,
     with_mouth,
 )
+from headbench.methods.gbs.spec import BlendshapeTraining, GBSConfig
 from headbench.methods.shared.avatar_files import Subject
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.splats import rasterize

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.methods.official.shim.blended import (
+from headbench.methods.official.shim.cpu import (
     BatchRasterizer,
     Settings,
     TargetRasterizer,

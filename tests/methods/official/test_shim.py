@@ -13,9 +13,12 @@ from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.methods.insta.marching import squared_distances
 from headbench.methods.official.method import LAUNCHER
 from headbench.methods.official.shim import blendshapes as shim
-from headbench.methods.official.shim.blended import GaussianRasterizationSettings, GaussianRasterizer
 from headbench.methods.official.shim.blendshapes import SMALLEST_AREA, Mesh, load_obj, rasterize_meshes
-from headbench.methods.official.shim.cpu import mean_square_distances
+from headbench.methods.official.shim.cpu import (
+    GaussianRasterizationSettings,
+    GaussianRasterizer,
+    mean_square_distances,
+)
 from headbench.methods.ops.planes import harmonic_colors, sh_basis
 from headbench.methods.shared.surface_points import texel_points
 from headbench.methods.splats import rasterize

@@ -10,7 +10,6 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.datasets.head.model import HeadModel
 from headbench.methods.ops.splats import directions_to, triangle_frames
 from headbench.methods.ours.appearance import OursAppearance
-from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.field import (
     RESIDUAL,
     CanonicalFrames,
@@ -22,6 +21,7 @@ from headbench.methods.ours.field import (
     plane_box,
 )
 from headbench.methods.ours.method import Ours
+from headbench.methods.ours.spec import Lines, OursConfig, Planes
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.optimisation import Optimiser
 from headbench.methods.shared.rendering import view_of

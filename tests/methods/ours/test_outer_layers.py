@@ -6,7 +6,7 @@ import torch
 
 from headbench.datasets.head.arrays import faces_in_region
 from headbench.methods.ours.appearance import expressive_triangles, outer_layers_start
-from headbench.methods.ours.config import Lines, OursConfig, OuterLayers, Penalty
+from headbench.methods.ours.spec import Lines, OursConfig, OuterLayers, Penalty
 from headbench.methods.shared.surface_points import SubjectMesh
 
 

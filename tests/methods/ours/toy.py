@@ -6,8 +6,8 @@ import torch
 from torch import nn
 
 from headbench.methods.ours.appearance import OursAppearance
-from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.field import FIELD_FILE, write_field
+from headbench.methods.ours.spec import Lines, OursConfig, Planes
 from headbench.methods.shared.avatar_files import SUBJECT_FILE, Subject, save_shared_head, write_subject
 from headbench.methods.shared.optimisation import Optimiser
 from headbench.methods.shared.rendering import view_of

@@ -12,8 +12,8 @@ from headbench.bench.contracts import FrameKey
 from headbench.datasets.synthetic.plan import FRONTAL, SyntheticSettings, load_geometry, plan_subject
 from headbench.methods.gbs.method import GBS
 from headbench.methods.gbs.spec import GBSConfig
-from headbench.methods.ours.config import OursConfig, PlannedCapacity
 from headbench.methods.ours.method import plan_capacity
+from headbench.methods.ours.spec import OursConfig, PlannedCapacity
 from headbench.methods.shared.avatar_files import clip_mesh
 from headbench.methods.shared.capacity import CONFIRMED, PictureMotion, picture_motion
 from headbench.methods.shared.config import Capacity
