@@ -223,10 +223,7 @@ def influences(
     squared = (points - landmarks.index_select(0, nearest)).square().sum(1)
     weight = ((far_squared - squared) / (far_squared - near_squared)).clamp(0, 1)
     near, far = (weight.detach() > 0).nonzero().squeeze(1), (weight.detach() < 1).nonzero().squeeze(1)
-    return (
-        Influence(near, weight.index_select(0, near)),
-        Influence(far, 1 - weight.index_select(0, far)),
-    )
+    return (Influence(near, weight.index_select(0, near)), Influence(far, 1 - weight.index_select(0, far)))
 
 
 class TrainingScene(NamedTuple):

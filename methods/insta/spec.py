@@ -190,12 +190,7 @@ INSTA = MethodSpec(
             "learning_rate": 2e-2,
         },
         "demo": {"budget": {"iterations": 400}, **SHORT},
-        "fast": {
-            "budget": {"iterations": 1_050},
-            **SHORT,
-            "log2_table": 17,
-            "finest_resolution": 768,
-        },
+        "fast": {"budget": {"iterations": 1_050}, **SHORT, "log2_table": 17, "finest_resolution": 768},
         "gpu": {"budget": {"iterations": 20_000}},
         "paper": {"budget": {"iterations": 20_000}},
     },

@@ -31,16 +31,7 @@ from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import threads
 from .checkout import Checkout, Environment, Repository, inspect_checkout, inspect_interpreter
 from .spec import OfficialConfig
-from .workplace import (
-    LOCK,
-    Listed,
-    Patch,
-    Workplace,
-    alone,
-    check_export,
-    remove,
-    write_launcher,
-)
+from .workplace import LOCK, Listed, Patch, Workplace, alone, check_export, remove, write_launcher
 
 TRAINING, RENDERING = "training", "rendering"
 """Temporary folders inside the avatar's, for training and for rendering."""
@@ -313,11 +304,7 @@ class OfficialMethod(ABC, Generic[Config]):
                 f"The training command of {checkout.folder} left no whole avatar: {error}"
             ) from error
         fit.progress(frames + iterations, frames + iterations)
-        official = {
-            **checkout.record,
-            "device": self.config.device,
-            "arguments": list(self.config.arguments),
-        }
+        official = {**checkout.record, "device": self.config.device, "arguments": list(self.config.arguments)}
         differences = self.differences(fit.clip, fit.seed) + self._of_launch(patches)
         summary = TrainingSummary(iterations, iterations, time.monotonic() - start)
         write_record(fit, summary, leaks=[], differences=differences, official=official)

@@ -308,12 +308,7 @@ class CapacityPlanner:
         self._decide(name, configured, chosen, reason, surface_px=area, least=float(least))
 
     def _decide(
-        self,
-        name: str,
-        configured: int | str | None,
-        chosen: int | str | None,
-        reason: str,
-        **numbers: float,
+        self, name: str, configured: int | str | None, chosen: int | str | None, reason: str, **numbers: float
     ) -> None:
         self.decisions.append(Decision(name, configured, chosen, reason, numbers))
 

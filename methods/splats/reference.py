@@ -241,11 +241,7 @@ def _pixel_centers(left: int, top: int, right: int, bottom: int) -> Tensor:
 
 
 def _composite_tile(
-    splats: Footprints,
-    colors: Tensor,
-    background: Tensor,
-    pixels: Tensor,
-    cut_offs: tuple[float, float],
+    splats: Footprints, colors: Tensor, background: Tensor, pixels: Tensor, cut_offs: tuple[float, float]
 ) -> Tensor:
     """Composite depth-sorted splats front to back onto ``pixels`` (P, 2); returns (P, C + 1), alpha last.
 

@@ -10,13 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from headbench.bench.contracts import (
-    STAGES,
-    Budget,
-    SharingAvatar,
-    StagedAvatar,
-    no_progress,
-)
+from headbench.bench.contracts import STAGES, Budget, SharingAvatar, StagedAvatar, no_progress
 from headbench.bench.errors import InputError
 from headbench.methods.flashavatar.method import FlashAvatar
 from headbench.methods.flashavatar.spec import FlashAvatarConfig

@@ -310,11 +310,7 @@ def _make_ga(
             splats, binding = read_ga_splats(path, len(head.faces), device)
         else:
             path = out / REDUCED_FILE
-            tensors = {
-                **splats,
-                "opacities": splats["opacities"][:, None],
-                BINDING: binding.to(torch.int32),
-            }
+            tensors = {**splats, "opacities": splats["opacities"][:, None], BINDING: binding.to(torch.int32)}
             write_reduced(path, tensors, recipe.storage)
             splats = {name: value.to(device) for name, value in read_reduced(path).items()}
             binding = splats.pop(BINDING).to(torch.int64)

@@ -113,10 +113,7 @@ def blended(weights: FloatArray, motions: tuple[FloatArray, FloatArray]) -> tupl
     """(N, 3, 3) and (N, 3): linear blend skinning (FLAME, section 3) of motions by (N, J) weights."""
     linear, shift = motions
     rest = 1.0 - weights.sum(axis=1)
-    return (
-        np.einsum("nj,jik->nik", weights, linear) + rest[:, None, None] * np.eye(3),
-        weights @ shift,
-    )
+    return (np.einsum("nj,jik->nik", weights, linear) + rest[:, None, None] * np.eye(3), weights @ shift)
 
 
 def rotation_of(vectors: FloatArray) -> FloatArray:

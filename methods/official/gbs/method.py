@@ -26,13 +26,7 @@ from ...shared.avatar_files import SUBJECT_FILE, Subject, head_arrays
 from ...shared.loop import Fit
 from ...shared.schedule import DensifySchedule, Timeline
 from ..checkout import Checkout, Repository
-from ..ga.head_files import (
-    OfficialHead,
-    obj_text,
-    padding_remarks,
-    pickled,
-    write_landmarks,
-)
+from ..ga.head_files import OfficialHead, obj_text, padding_remarks, pickled, write_landmarks
 from ..ga.method import RENDERED, TRAINED, check_mark, mark
 from ..method import OfficialMethod, read_identity
 from ..spec import GBS_OFFICIAL, GBSOfficialConfig, option_words

@@ -452,10 +452,7 @@ OF_BLENDSHAPES: dict[str, dict[str, Any]] = {
         "SoftPhongShader": SoftPhongShader,
         "look_at_view_transform": None,
     },
-    "point_cloud_utils": {
-        "sample_mesh_poisson_disk": sample_mesh_poisson_disk,
-        "load_mesh_vf": load_mesh,
-    },
+    "point_cloud_utils": {"sample_mesh_poisson_disk": sample_mesh_poisson_disk, "load_mesh_vf": load_mesh},
     "torch.utils.tensorboard": {"SummaryWriter": Silent},
 }
 """Stand-in modules for packages that are not installed, by name."""

@@ -8,13 +8,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from headbench.bench.errors import InputError
 from headbench.datasets.head.geometry import triangle_areas
-from headbench.methods.shared.surface_points import (
-    RADIUS,
-    poisson_disk,
-    spacing,
-    spread_points,
-    texel_points,
-)
+from headbench.methods.shared.surface_points import RADIUS, poisson_disk, spacing, spread_points, texel_points
 
 from ...datasets.head.toy import toy_head
 

@@ -9,10 +9,7 @@ import torch
 
 from headbench.bench.errors import UnavailableError
 from headbench.bench.native.loader import Kernel
-from headbench.methods.benchmarks.splats import (
-    SplatScene,
-    cloud,
-)
+from headbench.methods.benchmarks.splats import SplatScene, cloud
 from headbench.methods.splats import available_backends, cpu, rasterize
 
 from .cases import backends
