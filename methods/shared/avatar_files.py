@@ -124,7 +124,6 @@ def read_stored(
     - ``content_of``: checks the tensors and the metadata of a file, and returns the content; its last argument is the head
       model.
     - ``read_coded``: subject, tensors and metadata of the coded file (`avatars.compact.layouts.read_coded`).
-    - ``Raises `InputError` for damaged or incompatible files.``:
     """
     head, coded = read_shared_head(folder), folder / COMPACT_FILE
     if coded.exists():
