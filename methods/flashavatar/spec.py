@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ...bench.specs import Mechanism, MethodSpec
-from ..shared.config import HarmonicsTraining, SurfaceSettings, check_at_least_one
+from ..shared.config import HarmonicsTraining, SurfaceSettings, check_range
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,14 @@ class FlashAvatarConfig(SurfaceSettings, HarmonicsTraining):
     def __post_init__(self) -> None:
         super().__post_init__()
         HarmonicsTraining.__post_init__(self)
-        check_at_least_one(self, "layers")
+        check_range(self, "at least 1", "layers")
         bounds = {"frequencies": 16, "layers": 100, "hidden": 1_024, "hyper_gaussians": 128}
         for name, most in bounds.items():
             if not 0 <= getattr(self, name) <= most:
                 raise ValueError(f"{name} must be 0 to {most}, found {getattr(self, name)}")
         if not 0 < self.offset_m <= 100:
             raise ValueError(f"offset_m must be above 0 and up to 100, found {self.offset_m}")
-        if not 0 <= self.mouth_weight or not 0 <= self.ssim_weight:
-            raise ValueError("mouth_weight and ssim_weight must not be negative")
+        check_range(self, "at least 0", "mouth_weight", "ssim_weight")
 
 
 SHORT: dict[str, Any] = {

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ...bench.specs import Mechanism, MethodSpec
-from ..shared.config import Capacity, DensifiedTraining, HarmonicsTraining
+from ..shared.config import Capacity, DensifiedTraining, HarmonicsTraining, check_range
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,8 @@ class GBSConfig(HarmonicsTraining):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.samples < 1 or self.teeth_samples < 0:
-            raise ValueError("samples must be at least 1, and teeth_samples not negative")
-        if self.expressions < 0 or self.sample_spacing < 0:
-            raise ValueError("expressions and sample_spacing must not be negative")
+        check_range(self, "at least 1", "samples")
+        check_range(self, "at least 0", "teeth_samples", "expressions", "sample_spacing")
         if not 0 <= self.difference_sh_degree <= self.sh_degree:
             raise ValueError("difference_sh_degree must be 0 to sh_degree")
         if not 0 <= self.mask_floor_mm < self.mask_full_mm:

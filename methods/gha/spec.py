@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ...bench.specs import Mechanism, MethodSpec, ResolutionRule
-from ..shared.config import PAPER_ITERATIONS, check_at_least_one
+from ..shared.config import PAPER_ITERATIONS, check_range
 
 
 @dataclass(frozen=True)
@@ -120,29 +120,21 @@ class GHAConfig:
     """Seconds between checkpoints of the training."""
 
     def __post_init__(self) -> None:
-        check_at_least_one(self, "schedule_length", "landmarks", "grid_vertices", "features")
-        check_at_least_one(self, "mesh_views", "mesh_size", "landmark_timesteps")
+        check_range(
+            self, "at least 1", "schedule_length", "landmarks", "grid_vertices", "features", "max_points"
+        )
+        check_range(self, "at least 1", "mesh_views", "mesh_size", "landmark_timesteps")
+        check_range(self, "in (0, 1)", "mesh_fraction", "initial_opacity")
+        check_range(self, "in (0, 1]", "final_rate")
+        check_range(self, "above 0", "unit", "angle_unit")
+        check_range(self, "at least 0", "mouth_points", "start_steps", "expression_noise", "motion_steps")
+        check_range(self, "at least 0", "motion_weight", "appearance_margin")
         if not 3 <= self.channels <= 32:
             raise ValueError(f"channels must be 3 to 32, found {self.channels}")
-        if not 0 < self.mesh_fraction < 1 or not 0 < self.initial_opacity < 1:
-            raise ValueError("mesh_fraction and initial_opacity must lie between 0 and 1")
         if not 0 <= self.near_squared < self.far_squared:
             raise ValueError("near_squared must not be negative and far_squared must be larger")
-        if not 0 < self.final_rate <= 1:
-            raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")
         if not self.sr_widths or min(self.sr_widths) < 1:
             raise ValueError(f"sr_widths must have at least one width, all above 0, found {self.sr_widths}")
-        if self.max_points is not None and self.max_points < 1:
-            raise ValueError(f"max_points must be at least 1 or null, found {self.max_points}")
-        if not self.unit > 0 or not self.angle_unit > 0:
-            raise ValueError(f"unit and angle_unit must be above 0, found {self.unit} and {self.angle_unit}")
-        not_negative = (
-            *("mouth_points", "start_steps", "expression_noise", "motion_steps", "motion_weight"),
-            "appearance_margin",
-        )
-        for name in not_negative:
-            if (getattr(self, name) or 0) < 0:
-                raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")
 
     @property
     def upscale(self) -> int:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ...bench.specs import Mechanism, MethodSpec
-from ..shared.config import check_at_least_one
+from ..shared.config import check_range
 
 INSTANT_NGP_STEP = math.sqrt(3) / 1024
 
@@ -109,29 +109,18 @@ class InstaConfig:
             raise ValueError(f"log2_table must lie between 1 and 24, found {self.log2_table}")
         if not 2 <= self.base_resolution <= self.finest_resolution:
             raise ValueError("base_resolution must be at least 2 and at most finest_resolution")
-        check_at_least_one(self, "schedule_length", "levels", "hidden", "density_layers")
-        check_at_least_one(self, "color_layers", "latent", "occupancy_resolution", "occupancy_every")
-        check_at_least_one(
-            self, "samples_per_iteration", "first_rays", "images_per_iteration", "round_samples"
+        check_range(
+            self, "at least 1", "schedule_length", "levels", "hidden", "density_layers", "color_layers"
         )
-        for name in ("step", "shell_outside", "shell_inside", "prior_scale", "huber", "learning_rate"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be above 0, found {getattr(self, name)}")
-        for name in (
-            "conditions",
-            "mouth_weight",
-            "depth_weight",
-            "weight_decay",
-            "prior_depth",
-            "opacity_weight",
-        ):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")
-        for name in ("occupancy_decay", "occupancy_threshold", "ema", "stop_transmittance"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} must lie in [0, 1), found {getattr(self, name)}")
-        if not 0 < self.final_rate <= 1:
-            raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")
+        check_range(self, "at least 1", "latent", "occupancy_resolution", "occupancy_every", "round_samples")
+        check_range(self, "at least 1", "samples_per_iteration", "first_rays", "images_per_iteration")
+        check_range(
+            self, "above 0", "step", "shell_outside", "shell_inside", "prior_scale", "huber", "learning_rate"
+        )
+        check_range(self, "at least 0", "conditions", "mouth_weight", "depth_weight", "weight_decay")
+        check_range(self, "at least 0", "prior_depth", "opacity_weight")
+        check_range(self, "in [0, 1)", "occupancy_decay", "occupancy_threshold", "ema", "stop_transmittance")
+        check_range(self, "in (0, 1]", "final_rate")
 
 
 SHORT: dict[str, Any] = {

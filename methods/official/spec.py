@@ -16,7 +16,7 @@ from ..gha.spec import GHA
 from ..insta.spec import INSTA
 from ..ours.spec import OURS
 from ..rgbavatar.spec import RGBAVATAR
-from ..shared.config import PAPER_ITERATIONS, SHORT_SPLATS, check_at_least_one
+from ..shared.config import PAPER_ITERATIONS, SHORT_SPLATS, check_range
 
 
 def option_words(options: Mapping[str, Any]) -> list[str]:
@@ -50,8 +50,7 @@ class OfficialConfig:
     places: ClassVar[tuple[str, ...]] = ("checkout", "python", "time_limit_hours")
 
     def __post_init__(self) -> None:
-        if self.time_limit_hours is not None and self.time_limit_hours <= 0:
-            raise ValueError(f"time_limit_hours is above 0, or none; found {self.time_limit_hours}")
+        check_range(self, "above 0", "time_limit_hours")
 
     @property
     def label(self) -> str:
@@ -94,8 +93,7 @@ class GHAOfficialConfig(OfficialConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.mesh_fraction < 1:
-            raise ValueError(f"mesh_fraction must lie between 0 and 1, found {self.mesh_fraction}")
+        check_range(self, "in (0, 1)", "mesh_fraction")
         if self.arguments:
             raise ValueError("arguments must be empty: the authors' scripts have none")
 
@@ -119,7 +117,7 @@ class INSTAOfficialConfig(OfficialConfig):
     def __post_init__(self) -> None:
         if self.python:
             raise ValueError("python must be empty: the authors' code is a program; set program")
-        check_at_least_one(self, "images_on_gpu")
+        check_range(self, "at least 1", "images_on_gpu")
 
 
 SET_ENTRIES = (
@@ -152,7 +150,7 @@ class RGBAvatarOfficialConfig(OfficialConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least_one(self, "samples")
+        check_range(self, "at least 1", "samples")
         for each in self.values:
             if "=" not in each or each.partition("=")[0] in SET_ENTRIES:
                 known = f"NAME=VALUE of other entries than {', '.join(SET_ENTRIES)}, which headbench sets"
@@ -178,7 +176,7 @@ class FlashAvatarOfficialConfig(OfficialConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least_one(self, "samples")
+        check_range(self, "at least 1", "samples")
 
 
 def _short_rates(splats: Mapping[str, Any], colours: Mapping[str, Any]) -> tuple[str, ...]:

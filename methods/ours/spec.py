@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from ...bench.specs import Mechanism, MethodSpec
-from ..shared.config import Capacity, HarmonicsTraining, SplatTraining, splat_presets
+from ..shared.config import Capacity, HarmonicsTraining, SplatTraining, check_range, splat_presets
 
 Dynamic = Literal["opacity", "position", "rotation", "scale", "color"]
 """Attribute of a splat that an expression may change."""
@@ -46,9 +46,7 @@ class Planes:
     def __post_init__(self) -> None:
         if self.resolution < 2 or min(self.channels) < 1:
             raise ValueError("resolution must be at least 2, and channels at least 1")
-        for name in ("direction_smoothing", "residual_lr"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")
+        check_range(self, "at least 0", "direction_smoothing", "residual_lr")
 
 
 @dataclass(frozen=True)
@@ -81,8 +79,7 @@ class Lines:
     def __post_init__(self) -> None:
         if self.resolution < 2 or self.channels < 1:
             raise ValueError("resolution must be at least 2, and channels at least 1")
-        if self.expressions < 0 or self.jaw_bases < 0:
-            raise ValueError("expressions and jaw_bases must not be negative")
+        check_range(self, "at least 0", "expressions", "jaw_bases")
         if not self.dynamic or len(set(self.dynamic)) != len(self.dynamic):
             raise ValueError(f"dynamic must name at least one attribute, each once, found {self.dynamic}")
 
@@ -110,9 +107,7 @@ class Penalty:
     """Surface displacement below which opacity may not change, in the face region and elsewhere, and the weight elsewhere."""
 
     def __post_init__(self) -> None:
-        for name in ("ramp", "softness"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, found {getattr(self, name)}")
+        check_range(self, "at least 0", "ramp", "softness")
 
 
 @dataclass(frozen=True)
@@ -127,10 +122,9 @@ class OuterLayers:
     """Opacity of these splats at the start, between 0 and 1."""
 
     def __post_init__(self) -> None:
-        if self.count < 0 or not 0 < self.opacity < 1 or not self.gap > 0:
-            raise ValueError(
-                "count must not be negative, opacity must lie between 0 and 1, and gap must be above 0 metres"
-            )
+        check_range(self, "at least 0", "count")
+        check_range(self, "in (0, 1)", "opacity")
+        check_range(self, "above 0", "gap")
 
 
 @dataclass(frozen=True)
@@ -157,8 +151,7 @@ class PlannedCapacity(Capacity):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.detail > 0:
-            raise ValueError(f"detail must be above 0, found {self.detail}")
+        check_range(self, "above 0", "detail")
 
 
 @dataclass(frozen=True)
@@ -184,8 +177,7 @@ class OursConfig(HarmonicsTraining):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.hidden < 1:
-            raise ValueError(f"hidden must be at least 1, found {self.hidden}")
+        check_range(self, "at least 1", "hidden")
 
 
 RAMP: dict[str, Any] = {"penalty": {"ramp": 480_000}}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from ...bench.specs import Mechanism, MethodSpec
-from ..shared.config import SurfaceSettings, check_at_least_one
+from ..shared.config import SurfaceSettings, check_range
 
 INPUTS = ("expression", "neck", "jaw", "eyes", "eyelids", "translation")
 """Tracked parameters that the weights may depend on."""
@@ -81,26 +81,24 @@ class RGBAvatarConfig(SurfaceSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least_one(self, "blendshapes", "batch", "together", "color_every", "trained_per_arrival")
+        check_range(
+            self, "at least 1", "blendshapes", "batch", "together", "color_every", "trained_per_arrival"
+        )
         if not self.inputs or not set(self.inputs) <= set(INPUTS) or len(set(self.inputs)) < len(self.inputs):
             raise ValueError(f"inputs must be among {', '.join(INPUTS)}, each once, found {self.inputs}")
-        for name in ("initial_scale_mm", "position_lr", "position_lr_final"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be above 0, found {getattr(self, name)}")
+        check_range(self, "above 0", "initial_scale_mm", "position_lr", "position_lr_final")
+        check_range(self, "at least 0", "color_weight")
+        check_range(self, "in [0, 1]", "ssim_weight")
         if self.frame_variant == "official" and not self.uv_chart:
             raise ValueError("uv_chart must be true with frame_variant=official, whose axes follow the chart")
         if self.color_init_variant == "official" and not self.color_weight > 0:
             raise ValueError(
                 f"color_weight must be above 0 with color_init_variant=official, found {self.color_weight}"
             )
-        if not self.color_weight >= 0:
-            raise ValueError(f"color_weight must not be negative, found {self.color_weight}")
         if self.online and self.together != 1:
             raise ValueError(f"together must be 1 with online, found {self.together}")
         if self.online and self.batch > LOCAL:
             raise ValueError(f"batch must be at most {LOCAL} with online, found {self.batch}")
-        if not 0 <= self.ssim_weight <= 1:
-            raise ValueError(f"ssim_weight must lie in [0, 1], found {self.ssim_weight}")
 
     def initial_scale(self, count: int) -> float:
         """Size of each of ``count`` splats at the start, metres."""

@@ -9,17 +9,27 @@ Iterations are given on the published scale and mapped to the budget as fraction
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
+RANGES: Mapping[str, Callable[[Any], bool]] = {
+    "at least 1": lambda value: value >= 1,
+    "at least 0": lambda value: value >= 0,
+    "above 0": lambda value: value > 0,
+    "in (0, 1)": lambda value: 0 < value < 1,
+    "in (0, 1]": lambda value: 0 < value <= 1,
+    "in [0, 1)": lambda value: 0 <= value < 1,
+    "in [0, 1]": lambda value: 0 <= value <= 1,
+}
 
-def check_at_least_one(settings: object, *names: str) -> None:
-    """Raise `ValueError` for the first of some settings that is below 1; None is allowed."""
+
+def check_range(settings: object, wanted: str, *names: str) -> None:
+    """Raise `ValueError` for the first of some settings that is outside of a range of `RANGES`; None is allowed."""
     for name in names:
         value = getattr(settings, name)
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, found {value}")
+        if value is not None and not RANGES[wanted](value):
+            raise ValueError(f"{name} must be {wanted}, found {value}")
 
 
 @dataclass(frozen=True)
@@ -43,14 +53,11 @@ class SplatSettings:
     """Seconds between checkpoints of the training."""
 
     def __post_init__(self) -> None:
-        check_at_least_one(self, "schedule_length")
-        if not 0 < self.initial_opacity < 1:
-            raise ValueError(f"initial_opacity must lie between 0 and 1, found {self.initial_opacity}")
-        if not 0 < self.final_rate <= 1:
-            raise ValueError(f"final_rate must lie in (0, 1], found {self.final_rate}")
-        for field in fields(self):
-            if field.name.endswith(("_lr", "_share")) and not getattr(self, field.name) >= 0:
-                raise ValueError(f"{field.name} must not be negative, found {getattr(self, field.name)}")
+        check_range(self, "at least 1", "schedule_length")
+        check_range(self, "in (0, 1)", "initial_opacity")
+        check_range(self, "in (0, 1]", "final_rate")
+        rates = (field.name for field in fields(self) if field.name.endswith(("_lr", "_share")))
+        check_range(self, "at least 0", *rates)
 
 
 @dataclass(frozen=True)
@@ -69,7 +76,7 @@ class SurfaceSettings(SplatSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least_one(self, "samples", "hidden")
+        check_range(self, "at least 1", "samples", "hidden")
 
 
 @dataclass(frozen=True)
@@ -113,13 +120,10 @@ class DensifiedTraining(SplatSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least_one(self, "densify_every", "reset_every", "min_densify_every", "min_reset_every")
-        if not 0 < self.reset_opacity < 1:
-            raise ValueError(f"reset_opacity must lie between 0 and 1, found {self.reset_opacity}")
-        if not 0 <= self.ssim_weight <= 1:
-            raise ValueError(f"ssim_weight must lie in [0, 1], found {self.ssim_weight}")
-        if self.max_splats is not None and self.max_splats < 1:
-            raise ValueError(f"max_splats must be at least 1 or null, found {self.max_splats}")
+        intervals = ("densify_every", "reset_every", "min_densify_every", "min_reset_every")
+        check_range(self, "at least 1", *intervals, "max_splats")
+        check_range(self, "in (0, 1)", "reset_opacity")
+        check_range(self, "in [0, 1]", "ssim_weight")
 
 
 @dataclass(frozen=True)
@@ -148,7 +152,7 @@ class HarmonicsTraining:
     """Learning rates of the constant term and of the higher degrees of the spherical harmonics."""
 
     def __post_init__(self) -> None:
-        check_at_least_one(self, "sh_every", "min_sh_every")
+        check_range(self, "at least 1", "sh_every", "min_sh_every")
         if not 0 <= self.sh_degree <= 3:
             raise ValueError(f"sh_degree must be 0 to 3, found {self.sh_degree}")
 
@@ -164,8 +168,7 @@ class Capacity:
     """Pixels; smaller motion of the surface is ignored."""
 
     def __post_init__(self) -> None:
-        if not self.tolerance > 0:
-            raise ValueError(f"tolerance must be above 0 pixels, found {self.tolerance}")
+        check_range(self, "above 0", "tolerance")
 
 
 PAPER_ITERATIONS = 600_000
