@@ -7,16 +7,68 @@ metric states the network.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
-from ..bench.contracts import FloatArray
+from ..bench.contracts import ByteArray, FloatArray
+from ..bench.errors import InputError
+from ..bench.io.files import read_bytes, reading
 from ..bench.specs import MetricSpec, Need
 from .faces import AtLandmarks, DlibIdentity, FaceMetric, dlib_needs, named_file, network_need
 
-if TYPE_CHECKING:
-    from .arcface import ArcFace
+SIDE = 112
+"""Side of the network's input, pixels."""
+PLACES = np.array(
+    [[38.2946, 51.6963], [73.5318, 51.5014], [56.0252, 71.7366], [41.5493, 92.3655], [70.7299, 92.2041]]
+)
+"""Positions of the eyes, the tip of the nose and the corners of the mouth in the crop, pixels."""
+LENGTH = 512
+
+
+class ArcFace:
+    """The network in an ONNX file."""
+
+    def __init__(self, path: Path):
+        expected = f"a network of ONNX that maps a picture of {SIDE}x{SIDE} pixels to {LENGTH} numbers"
+        content = read_bytes(path, expected)
+        with reading(path, expected):
+            import cv2
+
+            self._network = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
+            found = self._run(np.zeros((SIDE, SIDE, 3), np.uint8))
+        if found.shape != (1, LENGTH):
+            raise InputError(path, "", expected, f"an output of shape {found.shape}")
+        if not np.isfinite(found).all():
+            raise InputError(path, "", expected, "numbers that are not finite")
+
+    def __call__(self, image: ByteArray, landmarks: FloatArray) -> FloatArray:
+        """(512,) embedding of the face in an (H, W, 3) 8-bit RGB image with (68, 2) landmarks of 300-W, pixels."""
+        import cv2
+
+        turn = alignment(five_points(landmarks), PLACES)
+        return self._run(np.asarray(cv2.warpAffine(image, turn, (SIDE, SIDE)), np.uint8))[0]
+
+    def _run(self, crop: ByteArray) -> FloatArray:
+        pixels = (crop.astype(np.float32) - 127.5) / 127.5
+        self._network.setInput(np.ascontiguousarray(pixels.transpose(2, 0, 1)[None]))
+        return np.array(self._network.forward(), float)
+
+
+def five_points(landmarks: FloatArray) -> FloatArray:
+    """(5, 2) centres of the eyes, tip of the nose and corners of the mouth, from (68, 2) landmarks of 300-W."""
+    eyes = landmarks[36:42].mean(axis=0), landmarks[42:48].mean(axis=0)
+    return np.stack([*eyes, landmarks[30], landmarks[48], landmarks[54]])
+
+
+def alignment(points: FloatArray, places: FloatArray) -> FloatArray:
+    """(2, 3) similarity transform of (N, 2) points to ``places`` with the least sum of squared distances."""
+    start, end = points @ (1, 1j), places @ (1, 1j)  # rotation and scale are one factor of complex numbers
+    away = start - start.mean()
+    factor = np.vdot(away, end) / np.vdot(away, away)
+    shift = end.mean() - factor * start.mean()
+    return np.array([[factor.real, -factor.imag, shift.real], [factor.imag, factor.real, shift.imag]])
+
 
 VARIABLE = "HEADBENCH_ARCFACE"
 REMEDY = (
@@ -49,8 +101,6 @@ class CsimArcFace(_Csim):
 
 
 def _arcface() -> ArcFace:
-    from .arcface import ArcFace
-
     return ArcFace(named_file("CSIM", VARIABLE, REMEDY))
 
 

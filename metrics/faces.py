@@ -15,7 +15,7 @@ import numpy as np
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.errors import HeadbenchError, InputError, LeftOutError, UnavailableError, install_extra
 from ..bench.specs import Need
-from .pairs import check_pair
+from .psnr import check_pair
 
 REMEDY = f"{install_extra('faces')} (Boost licence; networks CC0, but the 68 landmarks were trained on 300-W: no commercial use)."
 ENLARGED = 1

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..bench.contracts import ByteArray
 from ..bench.specs import MetricSpec
-from .pairs import check_pair
+from .psnr import check_pair
 
 FLICKER = MetricSpec(
     name="flicker",

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.specs import MetricSpec
-from .pairs import Mask, check_masks, check_pair
+from .psnr import Mask, check_masks, check_pair
 
 FLIP = MetricSpec(
     name="flip",
@@ -70,15 +70,10 @@ class _Filter(NamedTuple):
 
 @dataclass(frozen=True)
 class Flip:
-    """FLIP of 8-bit images at a given viewing size.
-
-    Attributes
-    ----------
-    pixels_per_degree : float
-        Pixels per degree of visual angle.
-    """
+    """FLIP of 8-bit images at a given viewing size."""
 
     pixels_per_degree: float = PIXELS_PER_DEGREE
+    """Pixels per degree of visual angle."""
 
     def __call__(self, image: ByteArray, target: ByteArray) -> float:
         """Mean of `map` over all pixels, 0 for identical images."""

@@ -20,7 +20,7 @@ import numpy as np
 from ..bench.contracts import ByteArray
 from ..bench.errors import UnavailableError
 from ..bench.specs import MetricSpec, Need
-from .pairs import check_pair
+from .psnr import check_pair
 
 DISPLAY = "standard_4k"
 RATE = 24.3

@@ -29,13 +29,15 @@ import functools
 import hashlib
 import importlib.util
 import os
+import re
 import shutil
 import urllib.request
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from http.client import HTTPException
 from itertools import groupby, islice
 from pathlib import Path
+from pickle import UnpicklingError
 
 import numpy as np
 import torch
@@ -44,9 +46,41 @@ from torch.nn import functional
 
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.errors import InputError, UnavailableError
-from ..bench.io.files import atomic_path, cache_folder, digest
-from .pairs import check_pair
-from .torch_file import read_weights
+from ..bench.io.arrays import check_numbers
+from ..bench.io.files import atomic_path, cache_folder, digest, open_regular, reading
+from .psnr import check_pair
+
+EXPECTED = "a PyTorch file of weights"
+
+
+def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
+    """Read the tensors named in ``shapes`` as float32, on the CPU."""
+    with open_regular(path, EXPECTED) as stream, reading(path, EXPECTED):
+        try:
+            content = torch.load(stream, map_location="cpu", weights_only=True)
+        except UnpicklingError as error:  # its message advises to load without weights_only
+            name = re.search(r"GLOBAL (\S+)", str(error))
+            found = f"the name {name[1]}, which no weights need" if name else "another pickle"
+            raise InputError(path, "", EXPECTED, found) from error
+    if not isinstance(content, dict):
+        raise InputError(path, "", "a dictionary of tensors", type(content).__name__)
+    return {name: _tensor(path, name, content.get(name), shape) for name, shape in shapes.items()}
+
+
+def _tensor(path: Path, name: str, value: object, shape: tuple[int, ...]) -> Tensor:
+    expected = f"a float tensor of shape {shape}"
+    if value is None:
+        raise InputError(path, name, expected, "no such entry", "Is it the file of another network?")
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        found = value.dtype if isinstance(value, Tensor) else type(value).__name__
+        raise InputError(path, name, expected, str(found))
+    if value.shape != shape:
+        raise InputError(path, name, expected, f"shape {tuple(value.shape)}")
+    with reading(path, expected, name):  # it may be sparse, or on the meta device
+        numbers = value.detach().to(torch.float32).contiguous()
+        check_numbers(path, name, numbers.numpy())
+    return numbers
+
 
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
@@ -59,24 +93,12 @@ NO_WEIGHTS = "LPIPS: weights missing, see headbench doctor"
 class Lpips:
     """LPIPS with its weights loaded, ready to compare frames.
 
-    Parameters
-    ----------
-    net : str
-        "alex" (the usual choice for evaluation), "squeeze" or "vgg".
-    weights : Path | None
-        File of the backbone, or folder to look in; see the module for the default.
-    device : str
-        Device of the network, which always computes in float32.
-    scaled : bool
-        Whether to scale images to [-1, 1], as the constants expect; False feeds [0, 1].
-    cache_mb : float
-        Maximum memory for cached features of ground-truth images, which the next method reuses, in 10^6
-        bytes.
-
-    Attributes
-    ----------
-    fingerprint : str
-        Hex digest of all weights in use, the same for a full file and one with only the convolutional part.
+    - ``net``: "alex" (the usual choice for evaluation), "squeeze" or "vgg".
+    - ``weights``: file of the backbone, or folder to look in; see the module for the default.
+    - ``device``: device of the network, which always computes in float32.
+    - ``scaled``: whether to scale images to [-1, 1], as the constants expect; False feeds [0, 1].
+    - ``cache_mb``: maximum memory for cached features of ground-truth images, which the next method reuses, in 10^6 bytes.
+    - ``fingerprint``: hex digest of all weights in use, the same for a full file and one with only the convolutional part.
     """
 
     def __init__(
@@ -293,11 +315,7 @@ def find_backbone(spec: NetworkSpec, path: Path | None = None) -> Path:
 
 
 def load_backbone(spec: NetworkSpec, path: Path) -> dict[str, Tensor]:
-    """Read the convolutional part of a weights file, a full torchvision file or one with only this part.
-
-    Raises `InputError` for a file of another kind, and for parameters that are missing, not finite or of
-    another shape.
-    """
+    """Read the convolutional part of a weights file, a full torchvision file or one with only this part."""
     return read_weights(path, {name: tuple(value.shape) for name, value in spec.build().state_dict().items()})
 
 

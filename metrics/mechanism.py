@@ -13,7 +13,6 @@ from ..bench.specs import DYNAMIC, MetricSpec
 
 THRESHOLDS = {"opacity": 0.05, "color": 0.05, "position": 0.5}
 """Range of a quantity above which a splat is dynamic; positions in millimetres."""
-
 DYNAMIC_SPLATS = MetricSpec(
     name=DYNAMIC,
     label="Dynamic splats",

@@ -22,7 +22,7 @@ from ..bench.contracts import ByteArray, FloatArray, IntArray
 from ..bench.errors import InputError
 from ..bench.io.arrays import check_numbers
 from ..bench.io.files import read_bytes, reading
-from .torch_file import read_weights
+from .lpips_network import read_weights
 
 COUNT = 98
 NEIGHBOURS = 10
@@ -36,10 +36,7 @@ MEAN_FACE = "meanface.txt"
 
 
 class PipNet:
-    """The network with weights from a file; the mean face is in the file `MEAN_FACE` in the same folder.
-
-    Raises `InputError` if one of the files is missing or invalid.
-    """
+    """The network with weights from a file; the mean face is in the file `MEAN_FACE` in the same folder."""
 
     def __init__(self, path: Path):
         self._mean_face = read_mean_face(path.with_name(MEAN_FACE))
@@ -129,12 +126,8 @@ def decode(maps: list[FloatArray], votes: IntArray) -> FloatArray:
     The cell with the highest score of a landmark predicts its position and those of its neighbours. The result is the mean
     of a landmark's own prediction and the ``votes`` for it by others.
 
-    Parameters
-    ----------
-    maps : list[FloatArray]
-        (98, S, S) scores of cells, x and y in the cell, and (980, S, S) x and y of each landmark's neighbours.
-    votes : IntArray
-        (98, V) indices, see `votes`.
+    - ``maps``: (98, S, S) scores of cells, x and y in the cell, and (980, S, S) x and y of each landmark's neighbours.
+    - ``votes``: (98, V) indices, see `votes`.
     """
     scores, x, y, neighbour_x, neighbour_y = maps
     best = scores.reshape(len(scores), -1).argmax(axis=1)
@@ -175,7 +168,7 @@ def face_box(landmarks: FloatArray, mean_face: FloatArray) -> IntArray:
 
 
 def read_mean_face(path: Path) -> FloatArray:
-    """Read (98, 2) positions in the crop, from 0 to 1, from a text file of 196 numbers. Raises `InputError`."""
+    """Read (98, 2) positions in the crop, from 0 to 1, from a text file of 196 numbers."""
     expected = f"the {2 * COUNT} numbers of the project PIPNet's file data/WFLW/meanface.txt"
     text = read_bytes(path, expected)
     with reading(path, expected):

@@ -145,17 +145,11 @@ class WholeFrames:
 class SpeedProtocol:
     """Amount of timed work. Every loop ends after its number of frames, or after its seconds and at least one
     frame.
-
-    Attributes
-    ----------
-    warm_up : int
-        Minimum number of warm-up frames. Warm-up ends when the median of the last ``window`` frames
-        lies within ``steady`` (relative) of the median of the ``window`` before.
-    depth : int
-        Number of frames in flight in the throughput loop.
     """
 
     warm_up: int = 30
+    """Minimum number of warm-up frames. Warm-up ends when the median of the last ``window`` frames lies within ``steady``
+    (relative) of the median of the ``window`` before."""
     warm_up_limit: int = 200
     warm_up_s: float = 5.0
     window: int = 10
@@ -164,7 +158,9 @@ class SpeedProtocol:
     latency_s: float = 10.0
     throughput: int = 300
     throughput_s: float = 4.0
+
     depth: int = 8
+    """Number of frames in flight in the throughput loop."""
     stages: int = 60
     stages_s: float = 3.0
     static: int = 40
@@ -184,8 +180,6 @@ def fps(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) -> Measurem
     changes; ``warm_up_frames``; ``stationary`` (1 or 0); ``load``, the mean number of busy processes of the last minute. A run
     adds the number of threads and of cores used by other processes.
     Values of different machines are not comparable.
-
-    Raises `InputError` for a workload with equal consecutive entries.
     """
     return measure_speed(avatar, workload)
 

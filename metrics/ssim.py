@@ -16,7 +16,7 @@ import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.specs import MetricSpec
-from .pairs import Mask, check_masks, check_pair
+from .psnr import Mask, check_masks, check_pair
 
 SSIM = MetricSpec(
     name="ssim",
@@ -37,27 +37,18 @@ Border = Literal["valid", "reflect", "zero"]
 
 @dataclass(frozen=True)
 class SsimForm:
-    """Differences between implementations of SSIM.
-
-    Attributes
-    ----------
-    window : Literal['gaussian', 'uniform']
-        "gaussian", 11 x 11 with standard deviation 1.5 and weights that sum to one; or "uniform", 7 x
-        7.
-    border : Border
-        "valid" uses only windows entirely inside the image; "reflect" (mirror about the outermost pixels)
-        and "zero" (black) pad the image and use a window for every pixel.
-    sample_covariance : bool
-        Whether to use the sample variances and covariance, n / (n - 1) times those of the window.
-    downsample : bool
-        Whether to average blocks of ``round(min(H, W) / 256)`` pixels a side first (Wang's suggestion
-        for large images), if that is more than one.
-    """
+    """Differences between implementations of SSIM."""
 
     window: Literal["gaussian", "uniform"] = "gaussian"
+    """"gaussian", 11 x 11 with standard deviation 1.5 and weights that sum to one; or "uniform", 7 x 7."""
     border: Border = "valid"
+    """"valid" uses only windows entirely inside the image; "reflect" (mirror about the outermost pixels) and "zero" (black) pad
+    the image and use a window for every pixel."""
     sample_covariance: bool = False
+    """Whether to use the sample variances and covariance, n / (n - 1) times those of the window."""
     downsample: bool = False
+    """Whether to average blocks of ``round(min(H, W) / 256)`` pixels a side first (Wang's suggestion for large images), if that
+    is more than one."""
 
     @cached_property
     def weights(self) -> FloatArray:

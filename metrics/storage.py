@@ -59,8 +59,6 @@ def storage(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]] = ()) ->
     ``shared_mb``, if the avatar declares its shared assets; ``primitives`` and ``primitive_bytes`` (bytes of all
     files over primitives), if it has splats and ``workload`` a pose; ``driving_bytes`` of one pose as float32 and
     ``driving_kb_s``, kilobytes per second at 25 frames per second, if ``workload`` has a pose.
-
-    Raises `InputError` if the avatar declares no file, or a missing one.
     """
     files = _checked(avatar.files())
     if not files:
@@ -98,7 +96,7 @@ def driving_bytes(pose: HeadPose) -> int:
 
 
 def _checked(paths: Iterable[Path]) -> list[Path]:
-    """Distinct files, sorted. Raises `InputError` for a missing one."""
+    """Distinct files, sorted."""
     files = sorted({path.resolve() for path in paths})
     for path in files:
         if not path.is_file():

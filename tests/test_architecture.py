@@ -187,7 +187,7 @@ READ_IN_ONE_PLACE = {
     r"\bnp\.load\(|\bzipfile\.ZipFile\(": {
         "bench/io/arrays.py",
         "datasets/nersemble/benchmark/submission.py",
-        "methods/avatars/formats.py",  # an archive just made in memory
+        "methods/avatars/export.py",  # an archive just made in memory
     },
     r"\bcv2\.im(read|readmulti|decode|decodemulti|write|writemulti|encode)\b": {
         "bench/io/images.py",
@@ -197,7 +197,7 @@ READ_IN_ONE_PLACE = {
     r"\bImage\.open\(|\bimageio\b|\bimread\(|\bimsave\(|skimage\.io\b|mimread|\.fromarray\(.*\.save\(": {
         "bench/io/images.py",  # the words, in the names of OpenCV's functions; the package that brings ffmpeg
         "methods/official/gha/method.py",  # names of packages that the authors' code needs
-        "methods/official/shim/unused.py",
+        "methods/official/shim/blendshapes.py",
     },
     r"\bcv2\.VideoCapture\(": {
         "bench/io/images.py",
@@ -208,7 +208,7 @@ READ_IN_ONE_PLACE = {
     r"\btorch\.load\(": {
         "methods/official/flashavatar/method.py",  # programs for the authors' interpreters, run there
         "methods/official/gbs/method.py",
-        "metrics/torch_file.py",
+        "metrics/lpips_network.py",
     },
 }
 

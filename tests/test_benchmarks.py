@@ -6,16 +6,16 @@ import torch
 from headbench.bench.contracts import no_progress
 from headbench.bench.doctor import findings, table, take_turns
 from headbench.bench.registry import discover
-from headbench.methods.benchmarks import avatar, splats, training
-from headbench.methods.benchmarks.scenes import cloud
+from headbench.methods.benchmarks import splats, training
+from headbench.methods.benchmarks.splats import cloud
 from headbench.methods.splats import available_backends, rasterize
 
 KERNELS = [name for name in available_backends() if name.startswith("cpu-")]
 SMALLEST = {
     splats.speed: ({"QUICK_GRID": ((300, 40, 30), (500, 33, 47))}, [*KERNELS, "33x47"]),
     splats.tradeoffs: ({"QUICK_TRADEOFF_SIZE": (600, 48, 40)}, ["exact", "float16", "8/255", "0.05"]),
-    avatar.speed: ({"QUICK_SIZES": ((700, 40, 32),)}, ["ratio", "deform", "rasterize", "700", "ga"]),
-    training.speed: ({"SIZE": (40, 32), "QUICK_ROUNDS": 2}, ["ga", "ours", "gbs", "_Rasterize"]),
+    training.avatar_speed: ({"QUICK_SIZES": ((700, 40, 32),)}, ["ratio", "deform", "rasterize", "700", "ga"]),
+    training.training_speed: ({"SIZE": (40, 32), "QUICK_ROUNDS": 2}, ["ga", "ours", "gbs", "_Rasterize"]),
 }
 
 

@@ -33,10 +33,14 @@ from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.loaders import load_head, read_chart
 from headbench.datasets.monocular.reader import read_video
 from headbench.datasets.steps.exclude import read_exclusions
-from headbench.methods.shared.checkpoint import load_checkpoint, save_checkpoint
-from headbench.methods.shared.ply import read_ply, write_ply
-from headbench.methods.shared.tensor_files import read_safetensors
-from headbench.metrics.torch_file import read_weights
+from headbench.methods.shared.tensor_files import (
+    load_checkpoint,
+    read_ply,
+    read_safetensors,
+    save_checkpoint,
+    write_ply,
+)
+from headbench.metrics.lpips_network import read_weights
 
 from .datasets.head.flame_files import legacy_pickle, write_flame
 from .datasets.head.toy import toy_head

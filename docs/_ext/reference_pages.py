@@ -70,15 +70,17 @@ def field_texts(cls: type) -> dict[str, str]:
             texts.update(parameters)
             continue
         body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body  # type: ignore[attr-defined]
-        for field, text in itertools.pairwise(body):
-            is_text = isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
-            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
-                texts[field.target.id] = " ".join(str(text.value.value).split())
-    families = {re.escape(name).replace(re.escape("..."), ".+"): name for name in texts if "..." in name}
-    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
-        family = next((name for pattern, name in families.items() if re.fullmatch(pattern, field.name)), "")
-        if family:
-            texts.setdefault(field.name, texts[family])
+        group: list[ast.AnnAssign] = []  # fields in consecutive lines share the text below them
+        for node in body:
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                follows = bool(group) and group[-1].end_lineno == node.lineno - 1
+                group = [*group, node] if follows else [node]
+                continue
+            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+                texts |= dict.fromkeys(
+                    (each.target.id for each in group), " ".join(str(node.value.value).split())
+                )  # type: ignore[union-attr]
+            group = []
     return texts
 
 

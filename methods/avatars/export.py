@@ -2,25 +2,238 @@
 
 from __future__ import annotations
 
+import importlib
+import io
+import json
+import struct
+import tempfile
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from ...bench.contracts import HeadAsset, HeadPose, Progress, SplatAvatar, no_progress
+from ...bench.contracts import FloatArray, HeadAsset, HeadPose, Progress, SplatAvatar, Splats, no_progress
 from ...bench.engine.stored import StoredAvatar, open_avatar
-from ...bench.errors import InputError
-from ...bench.io.files import check_writable
+from ...bench.errors import HeadbenchError, InputError, UnavailableError, install_extra
+from ...bench.io.files import check_writable, read_bytes, write_bytes
+from ...bench.io.provenance import RENDER, note, tool
 from ...bench.specs import CommandResult, command
-from ..ops.harmonics import harmonic_colors
+from ..ga.method import COLUMNS
+from ..ops.planes import C0, harmonic_colors
 from ..shared.avatar_files import read_shared_head
 from ..shared.rendering import view_of
+from ..shared.tensor_files import read_ply, write_ply
 from ..splats import rasterize
-from .formats import FORMATS, StoredSplats
-from .harmonics import DEGREE, harmonics_of
+from .harmonics import DEGREE, FIELD_OF_VIEW, direction_of, harmonics_of, orbit_camera
 from .settings import AvatarOptions, ExportGlbSettings, ExportOptions, ExportPlySettings, ExportSogSettings
-from .views import FIELD_OF_VIEW, direction_of, orbit_camera
 from .web.bake import Source
+
+STANDARD = COLUMNS[:-1]
+"""62 float32: position, zero normals, harmonics (the rest channel by channel), opacity logit, log-scales, wxyz."""
+OPACITY_MARGIN = 1e-6  # logits stay finite
+
+
+class StoredSplats(NamedTuple):
+    """Splats in world space, float32: (N, 3) means, (N, 4) quaternions wxyz, (N, 3) scales, (N,) opacities, and
+    harmonics along world directions, (N, 3) and (N, 3, 15)."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    dc: Tensor
+    rest: Tensor
+
+    @classmethod
+    def of(cls, posed: Splats, dc: Tensor, rest: Tensor) -> StoredSplats:
+        """Splats of an avatar with their harmonics; missing degrees are zero."""
+        every = torch.zeros(len(dc), 3, 15)
+        every[:, :, : rest.shape[2]] = rest
+        means, quats, scales, opacities = (
+            torch.from_numpy(np.asarray(values, np.float32))
+            for values in (posed.means, posed.quats, posed.scales, posed.opacities)
+        )
+        return cls(means, quats, scales, opacities, dc.float().cpu(), every)
+
+
+class Format(NamedTuple):
+    """Writer and reader of a format; ``check`` raises `UnavailableError` if a dependency is missing."""
+
+    check: Callable[[], Any]
+    write: Callable[[Path, StoredSplats], None]
+    read: Callable[[Path], StoredSplats]
+
+
+# ------------------------------------------------------------------ PLY
+
+
+def _write_ply(path: Path, splats: StoredSplats) -> None:
+    opacities = splats.opacities.numpy().astype(np.float64).clip(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    columns: list[FloatArray] = [
+        splats.means.numpy(),
+        np.zeros_like(splats.means.numpy()),
+        splats.dc.numpy(),
+        splats.rest.flatten(1).numpy(),
+        np.log(opacities / (1 - opacities))[:, None],
+        np.log(np.maximum(splats.scales.numpy(), np.finfo(np.float32).tiny)),
+        splats.quats.numpy(),
+    ]
+    write_ply(path, STANDARD, np.concatenate(columns, axis=1).astype(np.float32), note(RENDER))
+
+
+def _read_ply(path: Path) -> StoredSplats:
+    table = torch.from_numpy(read_ply(path, STANDARD))
+    return StoredSplats(
+        table[:, :3].contiguous(),
+        table[:, 58:].contiguous(),
+        table[:, 55:58].exp(),
+        torch.sigmoid(table[:, 54]),
+        table[:, 6:9].contiguous(),
+        table[:, 9:54].reshape(-1, 3, 15),
+    )
+
+
+# ------------------------------------------------------------------ glTF
+
+EXTENSION = "KHR_gaussian_splatting"
+"""Khronos, extensions/2.0/Khronos/KHR_gaussian_splatting: linear scales, opacities from 0 to 1, quaternions xyzw."""
+FLOAT, ARRAY_BUFFER, POINTS = 5126, 34962, 0
+HARMONICS = [(degree, number) for degree in range(4) for number in range(2 * degree + 1)]
+
+
+def _write_glb(path: Path, splats: StoredSplats) -> None:
+    harmonics = torch.cat([splats.dc[:, :, None], splats.rest], dim=2)
+    plain = (0.5 + C0 * splats.dc).clamp(0, 1)
+    # Points for viewers without support for splats; linear, as glTF's colours are.
+    linear = torch.where(plain <= 0.04045, plain / 12.92, ((plain + 0.055) / 1.055) ** 2.4)
+    attributes = {
+        "POSITION": splats.means,
+        "COLOR_0": torch.cat([linear, splats.opacities[:, None]], dim=1),
+        f"{EXTENSION}:ROTATION": torch.nn.functional.normalize(splats.quats[:, [1, 2, 3, 0]], dim=1),
+        f"{EXTENSION}:SCALE": splats.scales,
+        f"{EXTENSION}:OPACITY": splats.opacities,
+        **{
+            f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number}": harmonics[:, :, index]
+            for index, (degree, number) in enumerate(HARMONICS)
+        },
+    }
+    accessors: list[dict[str, Any]] = []
+    views: list[dict[str, int]] = []
+    blocks, place = [], 0
+    for values in attributes.values():
+        block = np.ascontiguousarray(values.numpy(), "<f4").tobytes()
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[1 if values.ndim == 1 else values.shape[1]]
+        accessors.append(
+            {"bufferView": len(views), "componentType": FLOAT, "count": len(values), "type": kind}
+        )
+        views.append({"buffer": 0, "byteOffset": place, "byteLength": len(block), "target": ARRAY_BUFFER})
+        blocks.append(block)
+        place += len(block)
+    low, high = splats.means.amin(0), splats.means.amax(0)
+    accessors[0] |= {"min": low.tolist(), "max": high.tolist()}
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {
+        "attributes": {name: number for number, name in enumerate(attributes)},
+        "mode": POINTS,
+        "extensions": {EXTENSION: extension},
+    }
+    header = {
+        "asset": {"version": "2.0", "generator": tool(), "extras": {"note": note(RENDER)}},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": place}],
+    }
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    whole = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + place)
+    whole += struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", place, b"BIN\0")
+    write_bytes(path, whole + b"".join(blocks))
+
+
+def _read_glb(path: Path) -> StoredSplats:
+    """Read what `_write_glb` wrote."""
+    content = read_bytes(path, "a GLB file")
+    (length,) = struct.unpack_from("<I", content, 12)
+    header, start = json.loads(content[20 : 20 + length]), 28 + length
+    found = {}
+    for name, number in header["meshes"][0]["primitives"][0]["attributes"].items():
+        accessor = header["accessors"][number]
+        view = header["bufferViews"][accessor["bufferView"]]
+        values = np.frombuffer(content, "<f4", view["byteLength"] // 4, start + view["byteOffset"])
+        found[name.removeprefix(f"{EXTENSION}:")] = torch.from_numpy(
+            values.reshape(accessor["count"], -1).copy()
+        )
+    harmonics = [found[f"SH_DEGREE_{degree}_COEF_{number}"] for degree, number in HARMONICS]
+    return StoredSplats(
+        *(found["POSITION"], found["ROTATION"][:, [3, 0, 1, 2]].contiguous()),
+        *(found["SCALE"], found["OPACITY"][:, 0]),
+        *(harmonics[0], torch.stack(harmonics[1:], dim=2)),
+    )
+
+
+# ------------------------------------------------------------------ SOG
+
+
+def _library() -> Any:
+    try:
+        return importlib.import_module("gaussforge").GaussForge()
+    except ImportError:
+        raise UnavailableError(
+            "SOG is written by gaussforge, which is not installed.", install_extra("formats")
+        ) from None
+
+
+def _converted(content: bytes, source: str, target: str) -> bytes:
+    result = _library().convert(content, source, target)
+    if "error" in result:
+        raise HeadbenchError(f"gaussforge could not turn {source} into {target}: {result['error']}")
+    return bytes(result["data"])
+
+
+def _write_sog(path: Path, splats: StoredSplats) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        ply = Path(folder) / "splats.ply"
+        _write_ply(ply, splats)
+        write_bytes(path, _marked(_converted(ply.read_bytes(), "ply", "sog")))
+
+
+def _marked(content: bytes) -> bytes:
+    """The archive with headbench and the digital source type in its meta.json."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as source, zipfile.ZipFile(out, "w") as target:
+        for name in source.namelist():
+            member = source.read(name)
+            if name == "meta.json":
+                meta = json.loads(member)
+                meta["asset"] = {"generator": f"{tool()}, GaussForge", "note": note(RENDER)}
+                member = json.dumps(meta, separators=(",", ":")).encode()
+            # A fixed time makes files of equal avatars equal.
+            target.writestr(zipfile.ZipInfo(name), member)
+    return out.getvalue()
+
+
+def _read_sog(path: Path) -> StoredSplats:
+    with tempfile.TemporaryDirectory() as folder:
+        ply = Path(folder) / "splats.ply"
+        ply.write_bytes(_converted(read_bytes(path, "a SOG file"), "sog", "ply"))
+        return _read_ply(ply)
+
+
+FORMATS = {
+    "ply": Format(lambda: None, _write_ply, _read_ply),
+    "glb": Format(lambda: None, _write_glb, _read_glb),
+    "sog": Format(_library, _write_sog, _read_sog),
+}
+
 
 VIEWS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.2))
 """Azimuth and elevation, radians, of the views in which the loss is measured."""
@@ -28,10 +241,7 @@ SIZE = 400
 
 
 def open_splats(settings: AvatarOptions) -> tuple[StoredAvatar, SplatAvatar]:
-    """The stored avatar named by a command, and the loaded avatar.
-
-    Raises `InputError` as `open_avatar` and `StoredAvatar.load` do, and for an avatar without splats.
-    """
+    """The stored avatar named by a command, and the loaded avatar."""
     stored = open_avatar(Path(settings.avatar), settings.method)
     avatar = stored.load()
     if not isinstance(avatar, SplatAvatar):

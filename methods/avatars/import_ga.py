@@ -24,10 +24,9 @@ from ...bench.specs import CommandResult, command
 from ...datasets.clip import CaptureClip
 from ...datasets.ga.tracking import TeethPolicy, Tracking, find_head, read_animation
 from ...datasets.head.arrays import HeadArrays
-from ..ga.config import GAConfig
-from ..ga.method import DRIVING_FILE
+from ..ga.method import DRIVING_FILE, PLY_FILE, read_ga_splats, write_ga_splats
 from ..ga.spec import GA as GA_SPEC
-from ..ga.storage import PLY_FILE, read_ga_splats, write_ga_splats
+from ..ga.spec import GAConfig
 from ..shared.avatar_files import (
     HEAD_FILE,
     SUBJECT_FILE,
@@ -55,10 +54,7 @@ class HeadSettings:
 
 @command("import ga", group="export", writes="out", kinds=("an avatar",))
 def import_avatar(settings: ImportGASettings, progress: Progress = no_progress) -> CommandResult:
-    """Import a GaussianAvatars PLY as an avatar of the method ga.
-
-    Raises `InputError` for invalid files and for an output folder that is not empty.
-    """
+    """Import a GaussianAvatars PLY as an avatar of the method ga."""
     ply, out = Path(settings.ply), Path(settings.out)
     ours = {AVATAR_FILE, LOCK_FILE, SUBJECT_FILE, HEAD_FILE, PLY_FILE, DRIVING_FILE}
     other = InputError(out, "", "a new or an empty folder", "one with files in it")

@@ -16,9 +16,9 @@ from torch import Tensor
 from ...bench.contracts import Progress
 from ...bench.doctor import Row, table
 from ...bench.specs import CommandResult
-from ..splats.constants import ALPHA_MIN
 from ..splats.rasterize import available_backends, rasterize
-from .scenes import (
+from ..splats.request import ALPHA_MIN
+from .splats import (
     DIFFERENTIABLE,
     DrawnScene,
     SplatScene,

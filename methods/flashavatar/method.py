@@ -18,21 +18,26 @@ from torch.nn.functional import huber_loss
 from ...bench.contracts import Changes, Clip, FloatArray, HeadPose
 from ..avatars.compact.layouts import offsets, read_coded
 from ..avatars.harmonics import turn_harmonics
-from ..ops.harmonics import coefficient_count, turned_colors
-from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
-from ..ops.planes import encode
-from ..shared.networks import initial_network, layer_names, tracked_inputs
+from ..ops.planes import coefficient_count, encode, turned_colors
+from ..ops.splats import TriangleFrames
+from ..shared.optimisation import initial_network, layer_names, tracked_inputs
 from ..shared.rendering import PlacedSplats, changes_of, rasterize_view
 from ..shared.schedule import ShuffledEpochs
 from ..shared.splat_training import initial_shapes
-from ..shared.subject_mesh import BoundedCache, mouth_mask
-from ..shared.surface_points import spacing
+from ..shared.surface_points import BoundedCache, mouth_mask, spacing
 from ..shared.surface_splats import SurfaceAvatar, SurfaceMethod, SurfaceTrainer
-from .config import FlashAvatarConfig
-from .hyper_gaussians import initial_gaussians
-from .model import INPUTS, TrainedSplats, changed, layer_of_points, network_outputs, network_sizes
+from .model import (
+    INPUTS,
+    TrainedSplats,
+    changed,
+    initial_gaussians,
+    layer_of_points,
+    network_outputs,
+    network_sizes,
+)
 from .spec import FLASHAVATAR as SPEC
+from .spec import FlashAvatarConfig
 
 BOUNDARY = "boundary"
 """Region at the lower end of the neck, where the mesh ends: the authors' chart has no texels there, so no splats."""

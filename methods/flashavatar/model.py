@@ -11,16 +11,65 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from ...bench.contracts import HeadAsset
-from ..ops.harmonics import coefficient_count
+from ..ops.planes import coefficient_count
 from ..ops.splats import apply_matrices, left_products
 from ..shared.avatar_files import settings_of_text, settings_text
-from ..shared.networks import input_count, layer_names, layer_shapes, outputs_of
-from ..shared.subject_mesh import SubjectMesh
-from ..shared.surface_points import SurfacePoints
+from ..shared.optimisation import input_count, layer_names, layer_shapes, outputs_of
+from ..shared.surface_points import SubjectMesh, SurfacePoints
 from ..shared.surface_splats import HeadSurface, SurfaceSplats
 from ..shared.tensor_files import check_sizes
-from .config import FlashAvatarConfig
-from .hyper_gaussians import WIDTHS, check_diagonals, conditional_means, gaussian_shapes
+from .spec import FlashAvatarConfig
+
+WIDTHS = {"offset": 3, "turn": 4, "size": 3}
+"""Columns of the outputs; each output has a separate Gaussian."""
+
+
+def gaussian_shapes(latent: int) -> dict[str, tuple[int]]:
+    """Shapes of the tensors for each splat, by name: none without a ``latent`` size.
+
+    For an output of o columns these are the mean (o + latent), the lower triangle of A (o (o + 1) / 2, by rows, with the
+    logarithms of the diagonal), and B (latent x o).
+    """
+    shapes: dict[str, tuple[int]] = {}
+    for part, width in WIDTHS.items() if latent else ():
+        mean, upper, lower = gaussian_names(part)
+        shapes |= {mean: (width + latent,), upper: (width * (width + 1) // 2,), lower: (latent * width,)}
+    return shapes
+
+
+def gaussian_names(part: str) -> tuple[str, str, str]:
+    """Names of mean, A and B of an output."""
+    return f"gaussian_mean_{part}", f"gaussian_upper_{part}", f"gaussian_lower_{part}"
+
+
+def initial_gaussians(count: int, latent: int) -> dict[str, Tensor]:
+    """Tensors of ``count`` splats whose outputs are 0 at every latent: zeros, so that A is the identity."""
+    return {name: torch.zeros(count, *shape) for name, shape in gaussian_shapes(latent).items()}
+
+
+def conditional_means(tensors: Mapping[str, Tensor], latents: Tensor) -> Tensor:
+    """(N, 10) conditional means of the outputs, one after the other, at the (N, latent) latents of the splats."""
+    means = []
+    for part, width in WIDTHS.items():
+        mean, upper, lower = (tensors[name] for name in gaussian_names(part))
+        rows, columns = torch.tril_indices(width, width, device=mean.device)
+        diagonal = rows == columns
+        entries = torch.where(diagonal, torch.where(diagonal, upper, 0).exp(), upper)
+        factor = upper.new_zeros(len(upper), width, width)
+        factor[:, rows, columns] = entries
+        away = (latents - mean[:, width:])[:, None]
+        moved = torch.bmm(away, lower.view(len(lower), -1, width)).mT
+        means.append(mean[:, :width] - torch.linalg.solve_triangular(factor.mT, moved, upper=True)[:, :, 0])
+    return torch.cat(means, 1)
+
+
+def check_diagonals(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Raise `InputError`, naming ``path``, for logarithms of the diagonals beyond `MAX_LOGARITHM`."""
+    for part, width in WIDTHS.items():
+        name = gaussian_names(part)[1]
+        rows, columns = torch.tril_indices(width, width)
+        check_sizes(path, tensors[name][:, rows == columns].abs(), name)
+
 
 INPUTS = ("expression", "jaw", "eyes", "eyelids")
 """Tracked parameters that the network takes, besides the encoded points."""
@@ -106,7 +155,7 @@ class TrainedSplats(SurfaceSplats[FlashAvatarConfig]):
 
     @classmethod
     def settings_of(cls, path: Path, text: str) -> FlashAvatarConfig:
-        """Settings with those of a `text`. Raises `InputError`, naming ``path``, for other text."""
+        """Settings with those of a `text`."""
         return settings_of_text(FlashAvatarConfig, RENDERING, text, path, cls.KEY, OPTIONAL)
 
     def checked(self, path: Path, head: HeadAsset, device: str) -> TrainedSplats:

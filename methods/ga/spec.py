@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 from ...bench.specs import Mechanism, MethodSpec
-from ..shared.config import splat_presets
+from ..shared.config import Capacity, HarmonicsTraining, SplatTraining, splat_presets
+
+
+@dataclass(frozen=True)
+class GAConfig(HarmonicsTraining):
+    """GaussianAvatars: spherical harmonics per splat, and tracking refined with the avatar."""
+
+    splats: SplatTraining = field(default_factory=SplatTraining)
+    capacity: Capacity = field(default_factory=Capacity)
+
+    refine_tracking: bool = True
+    """Whether to optimise expression, poses and translation of the training timesteps."""
+    expression_lr: float = 1e-3
+    pose_lr: float = 1e-5
+    translation_lr: float = 1e-6
+    """Learning rates of the refined expression coefficients, joint rotations and translation."""
+
 
 SHORT: dict[str, Any] = {"sh_dc_lr": 0.02, "sh_rest_lr": 1e-3}
 """Settings of runs much shorter than published (docs/explanation/methods/ga.md, "Presets")."""
-
 GA = MethodSpec(
     name="ga",
     default=True,
@@ -17,9 +33,9 @@ GA = MethodSpec(
     version="3",
     summary="GaussianAvatars: splats with spherical harmonics rigged to the triangles of the tracked mesh.",
     implementation="headbench.methods.ga.method:GA",
-    config="headbench.methods.ga.config:GAConfig",
-    needs="headbench.methods.shared.needs:splats",
-    variants="headbench.methods.avatars.derived.ga_variants:variants",
+    config="headbench.methods.ga.spec:GAConfig",
+    needs="headbench.methods.shared.method:splats",
+    variants="headbench.methods.avatars.derived.recipes:ga_variants",
     ablations={"no-refined-tracking": {"refine_tracking": False}},
     mechanism=Mechanism("refined tracking", "displacement by the refined tracking", "no-refined-tracking"),
     presets=splat_presets(SHORT, {}, quick=800, fast=4_000),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,14 +12,23 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag, normalize
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
+from ...bench.errors import InputError
+from ...bench.io.arrays import Member
 from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.geometry import rigid_alignment
 from ...datasets.head.model import joint_motions, pose_feature
 from ...datasets.head.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
-from ..ops.harmonics import coefficient_count, turned_colors
+from ..ops.planes import coefficient_count, turned_colors
 from ..ops.splats import WorldSplats, apply_matrices, left_products
-from ..shared.subject_mesh import SubjectMesh
-from ..shared.surface_points import MeshPoints, SurfacePoints
+from ..shared.surface_points import (
+    POINT_MEMBERS,
+    MeshPoints,
+    SubjectMesh,
+    SurfacePoints,
+    point_tensors,
+    take_points,
+)
+from ..shared.tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, write_tensors
 
 LARGEST_SCALE = 0.1
 """Maximum size of a splat, metres: training removes larger neutral splats, and expressions are clamped to it."""
@@ -32,25 +42,18 @@ def difference_widths(degree: int) -> dict[str, int]:
 
 
 class Entries(NamedTuple):
-    """Splat and expression of each row of the differences.
-
-    Attributes
-    ----------
-    starts : Tensor
-        (N + 1,) int64, the first row of each splat, and the number of rows.
-    owners : Tensor
-        (M,) int64, splat of each row, ascending.
-    weights : Tensor
-        (M,) weights of the rows; 1 if a row holds the difference at coefficient 1.
-    rows : Tensor
-        (M,) int64, 0 to M - 1.
-    """
+    """Splat and expression of each row of the differences."""
 
     starts: Tensor
+    """(N + 1,) int64, the first row of each splat, and the number of rows."""
     owners: Tensor
+    """(M,) int64, splat of each row, ascending."""
     expressions: Tensor
+
     weights: Tensor
+    """(M,) weights of the rows; 1 if a row holds the difference at coefficient 1."""
     rows: Tensor
+    """(M,) int64, 0 to M - 1."""
 
     @classmethod
     def of(cls, counts: Tensor, expressions: Tensor, weights: Tensor) -> Entries:
@@ -113,13 +116,9 @@ def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: Poin
     Each attribute is the neutral one plus its differences, initial and learnt (section 3.2 of the paper); positions
     and rotations then follow the joints (section 3.4).
 
-    Parameters
-    ----------
-    neutral : Mapping[str, Tensor]
-        Means (N, 3) metres, log_scales (N, 3), quats (N, 4), opacities (N,) logits, sh_dc (N, 3) and
-        sh_rest (N, 3, R).
-    differences : Tensor
-        (N, C), learnt and blended, in the columns of `difference_widths`.
+    - ``neutral``: means (N, 3) metres, log_scales (N, 3), quats (N, 4), opacities (N,) logits, sh_dc (N, 3) and sh_rest (N, 3,
+      R).
+    - ``differences``: (N, C), learnt and blended, in the columns of `difference_widths`.
     """
     rest = neutral["sh_rest"]
     by_rest = differences.shape[1] - sum(difference_widths(0).values())
@@ -146,30 +145,19 @@ PARTS = {"linear": 9, "offset": 3, "rotation": 9, "product": 16, "turn": 4, "shi
 
 
 class PointMotions(NamedTuple):
-    """Effect of a pose on splats.
-
-    Attributes
-    ----------
-    linear, offset : Tensor
-        (N, 9) and (N, 3), blended transforms of the joints with eyelids and translation; x -> A x +
-        b.
-    rotation : Tensor
-        (N, 9), the rotation in ``linear``.
-    product : Tensor
-        (N, 16), the matrix of left multiplication by its quaternion.
-    turn : Tensor
-        (N, 4) blended initial differences of rotation, multiplied by the initial quaternion.
-    shift : Tensor
-        (N, 3) initial differences of position, blended, and pose correctives; before the transform,
-        metres.
-    """
+    """Effect of a pose on splats."""
 
     linear: Tensor
     offset: Tensor
+    """(N, 9) and (N, 3), blended transforms of the joints with eyelids and translation; x -> A x + b."""
     rotation: Tensor
+    """(N, 9), the rotation in ``linear``."""
     product: Tensor
+    """(N, 16), the matrix of left multiplication by its quaternion."""
     turn: Tensor
+    """(N, 4) blended initial differences of rotation, multiplied by the initial quaternion."""
     shift: Tensor
+    """(N, 3) initial differences of position, blended, and pose correctives; before the transform, metres."""
 
     @classmethod
     def of(cls, rows: Tensor) -> PointMotions:
@@ -180,22 +168,12 @@ class PointMotions(NamedTuple):
 class Rig:
     """Points on the surface of a subject, moved as FLAME moves it, without expressions beyond the first K.
 
-    Parameters
-    ----------
-    head, shape, static_offset : HeadAsset, FloatArray, FloatArray
-        As for `SubjectMesh`.
-    points : SurfacePoints
-        Points on its neutral mesh.
-    expressions : int
-        K, number of leading expressions that splats follow; the joints follow all.
-
-    Attributes
-    ----------
-    at_points : MeshPoints
-        Interpolates values of the vertices at the points.
-    turns, turned : Tensor
-        (4 F, K) `initial_rotations` of the triangles with points, and (P,) int64 index of each
-        point's triangle in them.
+    - ``head``, ``shape``, ``static_offset``: as for `SubjectMesh`.
+    - ``points``: points on its neutral mesh.
+    - ``expressions``: K, number of leading expressions that splats follow; the joints follow all.
+    - ``at_points``: interpolates values of the vertices at the points.
+    - ``turns``, ``turned``: (4 F, K) `initial_rotations` of the triangles with points, and (P,) int64 index of each point's
+      triangle in them.
     """
 
     def __init__(
@@ -222,7 +200,7 @@ class Rig:
         self.turns = turns.flatten(0, 1)
 
     def arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
-        """Driving signal as tensors. Raises `InputError` for a pose of another head model."""
+        """Driving signal as tensors."""
         return self.mesh.arguments(poses)
 
     def coefficients(self, arguments: Mapping[str, Tensor]) -> Tensor:
@@ -266,12 +244,8 @@ def deformation_gradients(rest: Tensor, moved: Tensor) -> Tensor:
     (Sumner and Popovic, eq. 1 to 3). It takes a point x of the rest triangle's plane to ``Q (x - v0) + v0'``. A
     triangle without area has no such map and gets the identity.
 
-    Parameters
-    ----------
-    rest : Tensor
-        (F, 3, 3) corners, metres.
-    moved : Tensor
-        (..., F, 3, 3) corners.
+    - ``rest``: (F, 3, 3) corners, metres.
+    - ``moved``: (..., F, 3, 3) corners.
     """
     inverse, singular = torch.linalg.inv_ex(_edges(rest))
     maps = _edges(moved) @ inverse
@@ -307,14 +281,9 @@ def initial_rotations(vertices: Tensor, basis: Tensor, faces: Tensor) -> Tensor:
     Multiplied by the initial quaternion of a splat they are the published initial differences of rotation; differences
     are summed over expressions, and the sum is normalised.
 
-    Parameters
-    ----------
-    vertices : Tensor
-        (V, 3) neutral mesh, metres.
-    basis : Tensor
-        (V, 3, K) metres per unit coefficient.
-    faces : Tensor
-        (F, 3) int64.
+    - ``vertices``: (V, 3) neutral mesh, metres.
+    - ``basis``: (V, 3, K) metres per unit coefficient.
+    - ``faces``: (F, 3) int64.
     """
     rest = vertices.to(torch.float64)[faces]
     turns = torch.zeros(len(faces), 4, basis.shape[2], dtype=torch.float64, device=vertices.device)
@@ -335,14 +304,9 @@ def consistency_mask(
     an expression at coefficient 1. Rigid motion in an expression is removed first by aligning the back of the head,
     and the neck never moves.
 
-    Parameters
-    ----------
-    vertices : FloatArray
-        (V, 3) neutral mesh.
-    expressions : int
-        K, number of leading expressions.
-    floor, full : float
-        Displacements where the mask starts and where it is 1, metres.
+    - ``vertices``: (V, 3) neutral mesh.
+    - ``expressions``: K, number of leading expressions.
+    - ``floor``, ``full``: displacements where the mask starts and where it is 1, metres.
     """
     # Teeth have no expressions; the alignment of the scalp would give them some.
     still, neck, teeth = (
@@ -367,3 +331,100 @@ def entries_of(mask: FloatArray, triangles: IntArray) -> tuple[IntArray, IntArra
     at_points = mask[triangles]
     _, columns = np.nonzero(at_points)
     return (at_points > 0).sum(1), columns, at_points[at_points > 0]
+
+
+EXPRESSIONS = "expressions"
+"""Key of the file's metadata: number of leading expressions that may have differences."""
+GEOMETRY = {"means": 3, "log_scales": 3, "quats": 4, "opacities": 1, "sh_dc": 3}
+"""First columns of the (N, 14 + 3 R) float32 table of neutral splats; R harmonics above degree 0 by channel follow."""
+MEMBERS = {
+    "splats": Member("f", ("N", None), MAX_MAGNITUDE, "f4"),
+    **POINT_MEMBERS,
+    "moved_by": Member("u", ("N", "bytes"), dtype="u1"),
+    "differences": Member("f", (None, None), MAX_MAGNITUDE, "f4"),
+}
+
+
+class Stored(NamedTuple):
+    """Content of an avatar's file."""
+
+    neutral: dict[str, Tensor]
+    """Per-splat tensors by name, see `blendshapes.apply_pose`."""
+    points: SurfacePoints
+    """Surface point of each splat at the start of training."""
+    expressions: int
+
+    entries: Entries
+    """Rows of the differences; their weights are 1."""
+    differences: Tensor
+    """(M, C) difference at coefficient 1, in the columns of `blendshapes.difference_widths`."""
+
+
+def write_avatar(
+    path: Path,
+    neutral: Mapping[str, Tensor],
+    points: SurfacePoints,
+    expressions: int,
+    entries: Entries,
+    differences: Tensor,
+) -> None:
+    """Write an avatar as safetensors, exact.
+
+    A splat takes 4 (14 + 3 R) bytes for neutral attributes, 12 for its surface point, a bit for each expression, and 4
+    C bytes for each expression that moves it: 12,055 bytes with all harmonics and all of 50 expressions.
+    """
+    count = len(neutral["means"])
+    columns = [neutral[name].reshape(count, -1) for name in (*GEOMETRY, "sh_rest")]
+    moved_by = torch.zeros(count, expressions, dtype=torch.bool)
+    moved_by[entries.owners.cpu(), entries.expressions.cpu()] = True
+    tensors = {
+        **point_tensors(points),
+        "splats": torch.cat(columns, dim=1),
+        "moved_by": torch.from_numpy(np.packbits(moved_by.numpy(), axis=1)),
+        "differences": differences,
+    }
+    write_tensors(path, tensors, {EXPRESSIONS: str(expressions)})
+
+
+def stored_of(
+    path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str], head: HeadAsset, device: str
+) -> Stored:
+    """Check the content of a file that `write_avatar` wrote."""
+    said, expression_size = metadata.get(EXPRESSIONS, ""), head.expression_basis.shape[2]
+    if not said.isdecimal() or len(said) > 9 or int(said) > expression_size:
+        raise InputError(path, EXPRESSIONS, f"a number up to {expression_size}", repr(said[:20]))
+    expressions = int(said)
+    moved_by = _check(path, tensors, expressions)
+    owners, moving = np.nonzero(moved_by)
+    counts = torch.from_numpy(moved_by.sum(1)).to(device)
+    columns = tensors["splats"].to(device).split([*GEOMETRY.values(), _rest(tensors["splats"])], dim=1)
+    neutral = {name: column.contiguous() for name, column in zip((*GEOMETRY, "sh_rest"), columns)}
+    neutral["opacities"] = neutral["opacities"][:, 0]
+    neutral["sh_rest"] = neutral["sh_rest"].reshape(len(counts), 3, -1)
+    points = take_points(path, tensors, len(head.faces))
+    entries = Entries.of(counts, torch.from_numpy(moving).to(device), torch.ones(len(owners), device=device))
+    return Stored(neutral, points, expressions, entries, tensors["differences"].to(device))
+
+
+def _rest(splats: Tensor) -> int:
+    return splats.shape[1] - sum(GEOMETRY.values())
+
+
+def _check(path: Path, tensors: Mapping[str, Tensor], expressions: int) -> IntArray:
+    """(N, K) whether an expression moves a splat."""
+    sizes = check_tensors(path, tensors, MEMBERS, {"bytes": -(-expressions // 8)})
+    splats = tensors["splats"]
+
+    def require(name: str, fits: bool, expected: str) -> None:
+        if not fits:
+            raise InputError(path, name, expected, f"shape {tuple(tensors[name].shape)}, or other numbers")
+
+    rests = [3 * (coefficient_count(degree) - 1) for degree in range(4)]
+    require("splats", sizes["N"] > 0 and _rest(splats) in rests, f"(N, 14 + 3 R), 3 R one of {rests}")
+    check_sizes(path, splats[:, GEOMETRY["means"] : GEOMETRY["means"] + GEOMETRY["log_scales"]])
+    moved_by = np.unpackbits(tensors["moved_by"].numpy(), axis=1, count=expressions)
+    widths = [sum(difference_widths(d).values()) for d in range(4) if rests[d] <= _rest(splats)]
+    table = tensors["differences"]
+    fits = len(table) == int(moved_by.sum()) and table.shape[1] in widths
+    require("differences", fits, f"({int(moved_by.sum())}, C), C one of {widths}")
+    return moved_by.astype(np.int64)

@@ -25,11 +25,10 @@ from ...datasets.head.rotations import (
 )
 from ..shared.avatar_files import Subject
 from ..shared.rendering import View, scene_center, view_of
-from .config import GHAConfig
+from .spec import GHAConfig
 
 POSE_SIZE = 6
 """Axis-angle and translation."""
-
 ANGLES = 9
 """Names of jaw and eyes in the expression code, after the expression."""
 
@@ -71,17 +70,10 @@ class Driver:
     The canonical frame has the axes of the unposed head, its origin at the centre of the neutral landmarks, and a
     unit of ``unit`` metres: x_world = R (unit x) + T.
 
-    Parameters
-    ----------
-    shape, static_offset : FloatArray
-        (S,) identity and (V, 3) metres.
-    expression_scale : Tensor | None
-        (E,) divisor of the expression code; None for ones.
-    origin : FloatArray
-        (3,) origin of the canonical frame in the unposed head, metres.
-    center : FloatArray | None
-        (3,) metres, the origin of translations in `HeadMotion.code`, see `scene_center`; None for the
-        world's origin.
+    - ``shape``, ``static_offset``: (S,) identity and (V, 3) metres.
+    - ``expression_scale``: (E,) divisor of the expression code; None for ones.
+    - ``origin``: (3,) origin of the canonical frame in the unposed head, metres.
+    - ``center``: (3,) metres, the origin of translations in `HeadMotion.code`, see `scene_center`; None for the world's origin.
     """
 
     def __init__(
@@ -109,7 +101,7 @@ class Driver:
         self.expression_scale = expression_scale
 
     def arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
-        """Driving signal as tensors with a batch axis. Raises `InputError` for a pose of another head model."""
+        """Driving signal as tensors with a batch axis."""
         return self.model.pose_arguments(poses)
 
     @torch.no_grad()
@@ -231,10 +223,7 @@ def influences(
     squared = (points - landmarks.index_select(0, nearest)).square().sum(1)
     weight = ((far_squared - squared) / (far_squared - near_squared)).clamp(0, 1)
     near, far = (weight.detach() > 0).nonzero().squeeze(1), (weight.detach() < 1).nonzero().squeeze(1)
-    return (
-        Influence(near, weight.index_select(0, near)),
-        Influence(far, 1 - weight.index_select(0, far)),
-    )
+    return (Influence(near, weight.index_select(0, near)), Influence(far, 1 - weight.index_select(0, far)))
 
 
 class TrainingScene(NamedTuple):
@@ -275,7 +264,7 @@ class TrainingScene(NamedTuple):
 
 
 def training_scene(clip: Clip, config: GHAConfig, device: str, seed: int) -> TrainingScene:
-    """Prepare a clip. Raises `InputError` if its head model has no face region."""
+    """Prepare a clip."""
     subject = Subject.of(clip)
     identity = (clip.head, subject.shape, subject.static_offset)
     plain = Driver(*identity, np.zeros(3), 1.0, None, device)

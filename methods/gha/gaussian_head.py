@@ -14,20 +14,17 @@ from torch import Tensor
 from ...bench.contracts import Camera
 from ..ops.splats import WorldSplats, left_products
 from ..shared.rendering import rasterize_view, view_of
-from .config import GHAConfig
 from .driving import HeadMotion, Signal, influences
-from .networks import ATTRIBUTES, Controllers, Influences, Weights, encode, encode_pose, uniform
+from .mesh_head import ATTRIBUTES, Controllers, Influences, Weights, encode, encode_pose, uniform
+from .spec import GHAConfig
 
 POINTS = {"points": 3, "log_scales": 3, "quats": 4, "opacities": 1}
 """Attributes of a Gaussian except its features, with columns: canonical position and scale, rotation, opacity
 logit."""
-
 LARGEST_LOG_SCALE = 2.0
 """Maximum size of a Gaussian in canonical units, also for expressions far outside the training range."""
-
 REACH = 2
 """Distance from a drawn pixel, in pixels of the feature image, that super-resolution may colour."""
-
 COVERED = 1e-3
 """Alpha above which a pixel of the feature image counts as drawn."""
 
@@ -174,19 +171,15 @@ class SuperResolution:
     """Blocks of two 3x3 convolutions, each normalised over the image and rectified; a 1x1 convolution; a sigmoid.
 
     The first block works at the size of the features, each further one at twice the previous size.
-
-    Attributes
-    ----------
-    widths : tuple[int, ...]
-        Channels of the blocks.
-    residual : bool
-        Whether to add to the splatted colours, enlarged bilinearly and weighted by their alpha, instead of replacing
-        them; there is no sigmoid then, and the initial output is zero.
     """
 
     channels: int
+
     widths: tuple[int, ...]
+    """Channels of the blocks."""
     residual: bool = False
+    """Whether to add to the splatted colours, enlarged bilinearly and weighted by their alpha, instead of replacing them; there
+    is no sigmoid then, and the initial output is zero."""
 
     @property
     def upscale(self) -> int:
@@ -295,18 +288,11 @@ def posed(
 ) -> tuple[Tensor, ...]:
     """(N, 3) means, (N, 4) quaternions of any length, (N, 3) scales and (N,) opacities of a pose, in the world.
 
-    Parameters
-    ----------
-    rotation, translation : Tensor
-        (3, 3) and (3,), the motion of the canonical frame.
-    turn : Tensor
-        (4, 4), matrix of multiplication by the rotation's quaternion.
-    points, moves : Tensor
-        (N, 3) canonical points, and displacements before their factor.
-    log_scales, quats, opacities : Tensor
-        (N, 3), (N, 4) and (N,) logits, canonical.
-    changes : Tensor
-        (N, 8) changes of these by the networks, before their factor.
+    - ``rotation``, ``translation``: (3, 3) and (3,), the motion of the canonical frame.
+    - ``turn``: (4, 4), matrix of multiplication by the rotation's quaternion.
+    - ``points``, ``moves``: (N, 3) canonical points, and displacements before their factor.
+    - ``log_scales``, ``quats``, ``opacities``: (N, 3), (N, 4) and (N,) logits, canonical.
+    - ``changes``: (N, 8) changes of these by the networks, before their factor.
     """
     unit = config.unit
     scale, quat, faint = (config.attribute_scale * changes).split(list(ATTRIBUTES), dim=1)

@@ -18,21 +18,17 @@ from ..ops.splats import unturned
 from ..shared.loop import TrainingImages
 from ..shared.optimisation import Optimiser, OptimiserState, logit
 from ..shared.schedule import Sampler, Timeline, torch_generator
-from .config import GHAConfig
 from .driving import POSE_SIZE, Signal, TrainingScene, mouth_box
 from .gaussian_head import FeatureImage, GaussianHead, feature_background
-from .mesh_head import MeshHead, NeutralSurface
-from .mesh_training import grid_about
-from .networks import Weights
-from .tracked_motion import TrackedMotion
+from .mesh_head import MeshHead, NeutralSurface, Weights
+from .mesh_training import TrackedMotion, grid_about
+from .spec import GHAConfig
 
 NEIGHBOURS = 3
 SMALLEST_SQUARED = 1e-7
 """Minimum squared distance to neighbours for initial scales."""
-
 ZOOM = (0.8, 1.25)
 """Range of the random rescaling before super-resolution."""
-
 ALMOST_ONE = 1 - 1e-6
 """Features of the mesh are clamped to this, so that their inverse tanh is finite."""
 

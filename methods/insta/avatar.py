@@ -18,27 +18,27 @@ from ...bench.errors import HeadbenchError, InputError
 from ...bench.io.arrays import Member, check_arrays, read_npz
 from ...bench.io.documents import parse_json, read_json
 from ...bench.native.dispatch import fits
-from ..avatars.compact.container import codec_of
+from ..avatars.compact.coder import codec_of
 from ..avatars.compact.layouts import grid, read_coded
 from ..shared.avatar_files import COMPACT_FILE, SUBJECT_FILE, read_shared_head, read_subject, write_arrays
 from ..shared.rendering import changes_of
-from ..shared.subject_mesh import SubjectMesh, pose_key
+from ..shared.surface_points import SubjectMesh, pose_key
 from ..shared.threads import threads
 from . import kernel
-from .config import InstaConfig
 from .field import Architecture, Parameters, Prior, RadianceField
-from .marching import PosedSurface, Space, canonical_surface
-from .occupancy import Occupancy, occupied_space
-from .rendering import (
+from .marching import PosedSurface, Space, canonical_surface, mouth_triangles
+from .occupancy import (
     Marching,
+    Occupancy,
     PosedRays,
     box_corners,
     camera_rays,
+    occupied_space,
     pixels_by_blocks,
     pixels_of_hull,
     render_rays,
 )
-from .warp import mouth_triangles
+from .spec import InstaConfig
 
 RAYS_AT_ONCE = 1 << 15
 ROUND_SAMPLES = 4  # maximum; without gradients, testing the transmittance costs less than hidden samples
@@ -67,7 +67,7 @@ class InstaAvatar:
 
     @classmethod
     def read(cls, folder: Path, device: str) -> InstaAvatar:
-        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
+        """Read an avatar from its folder."""
         head, coded = read_shared_head(folder), folder / COMPACT_FILE
         if coded.exists():
             files, (subject, tensors, text) = [coded], read_coded(coded, head, grid)
@@ -90,7 +90,7 @@ class InstaAvatar:
 
     @torch.no_grad()
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """Render one frame. Raises `InputError` where the pose is of another head model."""
+        """Render one frame."""
         surface = self._posed(pose)
         rgb = np.empty((camera.height, camera.width, 3), np.float32)
         rgb[:] = np.asarray([float(channel) for channel in background], np.float32).clip(0, 1)
@@ -160,7 +160,7 @@ TABLE = "table"
 
 
 def read_settings(path: Path) -> InstaConfig:
-    """Read settings from JSON. Raises `InputError` for settings that are unknown or out of range."""
+    """Read settings from JSON."""
     return _settings(read_json(path), path)
 
 
@@ -188,10 +188,7 @@ def field_of(
     size: tuple[int, ...],
     device: str,
 ) -> tuple[dict[str, Tensor], np.ndarray]:
-    """Float32 parameters, and flat indices of occupied cells, of the arrays of a file.
-
-    Raises `InputError` for an array that is missing, not finite or of another shape or type.
-    """
+    """Float32 parameters, and flat indices of occupied cells, of the arrays of a file."""
     shapes, cells = architecture.shapes(), math.prod(size)
     members = {name: Member("f", shape) for name, shape in shapes.items()}
     check_arrays(path, arrays, {**members, OCCUPIED: Member("u", (-(-cells // 8),), dtype="u1")})
@@ -210,13 +207,9 @@ class RayColors(NamedTuple):
 class Inference:
     """A trained field in a space, prepared for rendering.
 
-    Parameters
-    ----------
-    mouth : Tensor
-        (F,) bool, as in `render_rays`.
-    backend : str
-        "reference" is `render_rays`; "auto" uses the kernel for parameters in float32 on the CPU. A
-        value of the kernel's ``instruction_sets()`` selects the kernel with that instruction set.
+    - ``mouth``: (F,) bool, as in `render_rays`.
+    - ``backend``: "reference" is `render_rays`; "auto" uses the kernel for parameters in float32 on the CPU. A value of the
+      kernel's ``instruction_sets()`` selects the kernel with that instruction set.
     """
 
     def __init__(

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from ...bench.native.dispatch import Operation
-from ..ops.harmonics import sh_basis
+from ..ops.planes import sh_basis
 from ..shared.schedule import torch_generator
 from ..shared.threads import threads
 from . import kernel
-from .config import InstaConfig
+from .spec import InstaConfig
 
 SH_DEGREE = 3  # 16 basis functions; the published program calls that degree 4
 DIRECTIONS = (SH_DEGREE + 1) ** 2

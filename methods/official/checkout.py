@@ -18,12 +18,11 @@ from ...bench.errors import InputError
 from ...bench.io.documents import checked, parse_json
 from ...bench.io.files import read_bytes
 from ...bench.process import environment
-from .config import INSTAOfficialConfig, OfficialConfig
+from .spec import INSTAOfficialConfig, OfficialConfig
 
 SHORTEST_COMMIT = 7
 PROBE_S = 300.0
 """Time limit for the interpreter to import the required modules, seconds; the first import reads them from disk."""
-
 SHIM = "headbench.methods.official.shim.cpu"
 SHIMMED = (
     *("diff_gaussian_rasterization", "simple_knn", "nvdiffrast"),
@@ -31,7 +30,6 @@ SHIMMED = (
     *("lpips", "yacs", "loguru", "skimage"),
 )
 """Packages and modules that the shim replaces."""
-
 _PROBE = """
 import importlib, json, sys
 found = {"python": sys.version.split()[0], "missing": {}, "failed": ""}
@@ -60,49 +58,37 @@ print("headbench-devices", 0 if driver.cuInit(0) or driver.cuDeviceGetCount(ctyp
 
 @dataclass(frozen=True)
 class Repository:
-    """Description of an official repository.
-
-    Attributes
-    ----------
-    commit : str
-        The commit that its adapter was written for.
-    scripts : tuple[str, ...]
-        Files that identify its checkout.
-    modules : tuple[str, ...]
-        Modules that its interpreter must be able to import, if it has one.
-    trial : str
-        A statement that its interpreter must execute, or "", and the remedy if it fails.
-    downloads : Mapping[str, str]
-        Files that the authors distribute separately and expect in the checkout, with their sources.
-    """
+    """Description of an official repository."""
 
     url: str
+
     commit: str
+    """The commit that its adapter was written for."""
     scripts: tuple[str, ...]
+    """Files that identify its checkout."""
     modules: tuple[str, ...]
+    """Modules that its interpreter must be able to import, if it has one."""
     trial: str = ""
+    """A statement that its interpreter must execute, or "", and the remedy if it fails."""
     trial_remedy: str = ""
+
     downloads: Mapping[str, str] = field(default_factory=dict)
+    """Files that the authors distribute separately and expect in the checkout, with their sources."""
 
 
 @dataclass(frozen=True)
 class Checkout:
-    """A validated checkout.
-
-    Attributes
-    ----------
-    python : tuple[str, ...]
-        Command of the interpreter, or of the program if the code is a program.
-    record : dict[str, Any]
-        Commit, modified files and versions, for the avatar's record.
-    """
+    """A validated checkout."""
 
     folder: Path
+
     python: tuple[str, ...]
+    """Command of the interpreter, or of the program if the code is a program."""
     record: dict[str, Any]
+    """Commit, modified files and versions, for the avatar's record."""
 
     def constant(self, file: str, pattern: str, what: str) -> str:
-        """First group of ``pattern`` in a source file. Raises `InputError` without a match."""
+        """First group of ``pattern`` in a source file."""
         return find_constant(self.folder, file, pattern, what)
 
 

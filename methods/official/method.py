@@ -30,17 +30,8 @@ from ..shared.loop import Fit, TrainingSummary, check_budget, check_training_spl
 from ..shared.schedule import ShuffledEpochs
 from ..shared.threads import threads
 from .checkout import Checkout, Environment, Repository, inspect_checkout, inspect_interpreter
-from .config import OfficialConfig
-from .workplace import (
-    LOCK,
-    Listed,
-    Patch,
-    Workplace,
-    alone,
-    check_export,
-    remove,
-    write_launcher,
-)
+from .spec import OfficialConfig
+from .workplace import LOCK, Listed, Patch, Workplace, alone, check_export, remove, write_launcher
 
 TRAINING, RENDERING = "training", "rendering"
 """Temporary folders inside the avatar's, for training and for rendering."""
@@ -128,7 +119,7 @@ class OfficialMethod(ABC, Generic[Config]):
 
     @abstractmethod
     def read_back(self, frame: Listed, path: Path, background: Sequence[float], work: Workplace) -> Frame:
-        """A render for its camera. Raises `InputError` for a render of another size or frame."""
+        """A render for its camera."""
 
     def differences(self, clip: Clip, seed: int) -> list[str]:
         """Differences from the published code, for the record."""
@@ -313,11 +304,7 @@ class OfficialMethod(ABC, Generic[Config]):
                 f"The training command of {checkout.folder} left no whole avatar: {error}"
             ) from error
         fit.progress(frames + iterations, frames + iterations)
-        official = {
-            **checkout.record,
-            "device": self.config.device,
-            "arguments": list(self.config.arguments),
-        }
+        official = {**checkout.record, "device": self.config.device, "arguments": list(self.config.arguments)}
         differences = self.differences(fit.clip, fit.seed) + self._of_launch(patches)
         summary = TrainingSummary(iterations, iterations, time.monotonic() - start)
         write_record(fit, summary, leaks=[], differences=differences, official=official)
@@ -401,7 +388,7 @@ def _read_back(
     work: Workplace,
     ended: ProgramEnd,
 ) -> Iterator[tuple[FrameKey, Frame]]:
-    """Renders by the names of the index. Raises `InputError` unless these and no others exist."""
+    """Renders by the names of the index."""
     renders = work.model / method.render_folder
     index = {name: FrameKey(*key) for name, key in read_json(work.root / INDEX).items()}
     found = {path.name for path in renders.glob(method.render_files)}

@@ -8,7 +8,6 @@ from typing import Any
 from ...bench.errors import InputError
 from ...bench.specs import Need
 from .checkout import inspect_folder
-from .config import OfficialConfig
 from .flashavatar.method import FlashAvatarOfficial
 from .ga.method import GAOfficial
 from .gbs.method import GBSOfficial
@@ -16,6 +15,7 @@ from .gha.method import GHAOfficial
 from .insta.method import INSTAOfficial
 from .method import OfficialMethod
 from .rgbavatar.method import RGBAvatarOfficial
+from .spec import OfficialConfig
 from .tga.method import TGAOfficial
 
 METHODS: dict[type[OfficialConfig], type[OfficialMethod[Any]]] = {

@@ -3,10 +3,11 @@ Metrical Tracker."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import sys
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from ...bench.contracts import (
     FrameKey,
     HeadAsset,
     HeadPose,
+    IntArray,
     Progress,
 )
 from ...bench.errors import InputError
@@ -28,12 +30,64 @@ from ...bench.io.files import atomic_path
 from ...bench.io.images import read_pixels
 from ...datasets.head.loaders import FLAME_IDENTITY_SIZE
 from ...datasets.head.rotations import rotation_of
-from ...datasets.head.subject import BATCH, PosedSubject, camera_in_head_frame
+from ...datasets.head.subject import BATCH, PosedSubject, camera_in_head_frame, pose_in_head_frame
 from ...datasets.images import write_image
 from ...datasets.steps.masks import recomposite
+from ..insta.marching import CanonicalSurface, PosedSurface
+from ..insta.occupancy import camera_rays
 from ..shared.avatar_files import Subject
+from ..shared.surface_points import pose_key
 from .ga.head_files import EXPRESSION_SIZE, ArrayPickler, OfficialHead, padded
-from .workplace import Listed
+from .method import OfficialMethod
+from .spec import OfficialConfig
+from .workplace import Listed, Workplace, write_launcher
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleSurface:
+    """The surface in P covered pixels of a frame."""
+
+    rows: IntArray
+    columns: IntArray
+    """(P,) the pixels."""
+    triangles: IntArray
+    """(P,) first triangle of the head on the ray of each; -1 for pixels beside the mesh."""
+    depths: FloatArray
+    """(P,) metres along the camera's axis; not defined for pixels beside the mesh."""
+    vertices: FloatArray
+    """(V, 3) the posed mesh in the head's frame, metres."""
+
+    @property
+    def hit(self) -> np.ndarray:
+        """(P,) whether a pixel shows the mesh."""
+        return np.asarray(self.triangles >= 0)
+
+
+class VisibleMesh:
+    """Casts rays at the mesh of a subject in the head's frame; the mesh of the last pose is cached."""
+
+    def __init__(self, head: HeadAsset, posed: PosedSubject):
+        self._posed = posed
+        self._surface = CanonicalSurface(head, torch.from_numpy(posed.neutral))
+        self._last: tuple[bytes, PosedSurface] | None = None
+
+    def seen(self, pose: HeadPose, camera: Camera, coverage: ByteArray) -> VisibleSurface:
+        """The surface in the pixels that an (H, W) mask covers, for a camera in the head's frame."""
+        rows, columns = np.nonzero(coverage)
+        rays = camera_rays(camera, columns, rows, 0.0)
+        surface = self._of(pose)
+        found = surface.first_hit(rays)
+        along = rays.directions @ np.asarray(camera.world_to_camera[2, :3])
+        vertices = np.asarray(surface.vertices.numpy(), np.float64)
+        return VisibleSurface(rows, columns, found.triangles.numpy(), found.values.numpy() * along, vertices)
+
+    def _of(self, pose: HeadPose) -> PosedSurface:
+        still = pose_in_head_frame(pose)
+        key = pose_key(still)
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._surface.pose(torch.from_numpy(self._posed.meshes([still])[0]))
+        return self._last[1]
+
 
 SAME_INTRINSICS = 0.05
 """Tolerance of focal lengths and principal points of one video, pixels."""
@@ -45,7 +99,7 @@ def check_masks(clip: Clip) -> None:
 
 
 def coverage_of(clip: Clip, key: FrameKey) -> ByteArray:
-    """(H, W) mask of a frame. Raises `InputError` if it is missing."""
+    """(H, W) mask of a frame."""
     mask = clip.mask(key)
     if mask is None:
         expected = "a mask; the code trains only on the head, selected by the fourth channel of its images"
@@ -154,19 +208,14 @@ def frame_parts(**parts: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.nda
 
 @dataclass(frozen=True, eq=False)
 class FlameSubject:
-    """A head model with FLAME's vertices and one identity, for loaders of tracked videos.
-
-    Attributes
-    ----------
-    official : OfficialHead
-        The model without teeth.
-    posed : PosedSubject
-        The clip's own, with teeth if it has them.
-    """
+    """A head model with FLAME's vertices and one identity, for loaders of tracked videos."""
 
     official: OfficialHead
+    """The model without teeth."""
     identity: Subject
+
     posed: PosedSubject
+    """The clip's own, with teeth if it has them."""
 
     @classmethod
     def of(cls, head: HeadAsset, subject: Subject, vertices: int, file: Path) -> FlameSubject:
@@ -247,3 +296,61 @@ def read_covered(frame: Listed, path: Path, background: Sequence[float]) -> Fram
         raise InputError(path, str(frame.key), "colours and coverage (RGBA)", f"shape {pixels.shape}")
     rgba = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA).astype(np.float32) / 255
     return on_background(rgba[..., :3], rgba[..., 3], background)
+
+
+LAUNCHER = Path(__file__).with_name("parts.py")
+
+Config = TypeVar("Config", bound=OfficialConfig)
+
+
+@dataclass(frozen=True)
+class RenderCall:
+    """One call of the authors' renderer."""
+
+    command: list[str]
+    """The command, run in the program's working directory."""
+    numbers: list[int]
+    """Numbers of its frames in the list, in the order in which it renders them."""
+    renders: str
+    """Folder of its renders ``00000.png`` and following."""
+    cameras: list[str] = field(default_factory=list)
+    """A JSON of the listed cameras, and the one that the program writes beside its renders, which must agree; empty if it
+    writes none."""
+
+
+class PartsMethod(OfficialMethod[Config]):
+    """Renders a list by the launcher `parts`, which gives each render the number of its frame."""
+
+    frame_line = r"^headbench: drawn (\d+)"
+    starts_launcher = False
+
+    def command_of(self, calls: Sequence[RenderCall], drawn: str, work: Workplace) -> list[str]:
+        """Write the launcher and its plan; return its command, for headbench's interpreter.
+
+        ``drawn`` is a regular expression for the frames done in the output of the calls.
+        """
+        renders = work.model / self.render_folder
+        renders.mkdir(parents=True)
+        plan = {"drawn": drawn, "renders": str(renders), "parts": [asdict(call) for call in calls]}
+        return [sys.executable, *write_launcher(LAUNCHER, plan, work)]
+
+    def read_back(self, frame: Listed, path: Path, background: Sequence[float], work: Workplace) -> Frame:
+        """A render on black, composited on the background by its coverage."""
+        return read_covered(frame, path, background)
+
+
+def same_intrinsics(frame: Listed) -> Hashable:
+    """Equal for frames of one image size, focal length and principal point."""
+    return frame.camera.width, frame.camera.height, frame.camera.K.tobytes()
+
+
+def in_parts(
+    frames: Sequence[Listed], key: Callable[[Listed], Hashable], most: int
+) -> Iterator[list[Listed]]:
+    """Groups of frames with equal keys, at most ``most`` each, in order."""
+    groups: dict[Hashable, list[Listed]] = {}
+    for frame in frames:
+        groups.setdefault(key(frame), []).append(frame)
+    for same in groups.values():
+        for start in range(0, len(same), most):
+            yield same[start : start + most]

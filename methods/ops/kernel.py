@@ -16,7 +16,6 @@ from ..splats.cpu import KERNEL, instruction_sets
 
 UNITS_STEP = 16
 """Layers of networks are padded with zero units to a multiple of this."""
-
 _backend: ContextVar[str] = ContextVar("backend of compiled operations", default="cpu")
 
 

@@ -28,11 +28,7 @@ def window_weights(dtype: torch.dtype = torch.float32, device: str = "cpu") -> T
 
 def blur(planes: Tensor) -> Tensor:
     """Gaussian window of SSIM (11 x 11, sigma 1.5) over (C, H, W), zeros outside."""
-    weights, channels, half = (
-        window_weights(planes.dtype, str(planes.device)),
-        len(planes),
-        WINDOW // 2,
-    )
+    weights, channels, half = (window_weights(planes.dtype, str(planes.device)), len(planes), WINDOW // 2)
     column, row = weights.view(1, 1, WINDOW, 1), weights.view(1, 1, 1, WINDOW)
     vertical = F.conv2d(planes[None], column.expand(channels, -1, -1, -1), padding=(half, 0), groups=channels)
     return F.conv2d(vertical, row.expand(channels, -1, -1, -1), padding=(0, half), groups=channels)[0]
@@ -44,10 +40,7 @@ def mean_ssim(image: Tensor, truth: Tensor) -> Tensor:
     Wang et al. 2004, eq. 13 with population moments. This is not an evaluation metric: the zero padding lowers values
     at borders.
 
-    Parameters
-    ----------
-    image, truth : Tensor
-        (3, H, W) in [0, 1].
+    ``image``, ``truth``: (3, H, W) in [0, 1].
     """
     blurred = blur(torch.cat([image, truth, image * image + truth * truth, image * truth]))
     mean_x, mean_y, squares, products = blurred.split(len(image))

@@ -12,19 +12,17 @@ from torch import Tensor
 from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import faces_in_region
 from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
-from ..ops.harmonics import harmonic_colors, initial_coefficients
-from ..ops.mesh import NORMAL, TriangleFrames
-from ..ops.planes import Bounds, line_offsets, plane_colors, smoothing
-from ..ops.splats import directions_to, to_world
+from ..ops.planes import Bounds, harmonic_colors, initial_coefficients, line_offsets, plane_colors, smoothing
+from ..ops.splats import NORMAL, TriangleFrames, directions_to, to_world
 from ..shared.optimisation import Optimiser
 from ..shared.rendering import View
 from ..shared.schedule import Timeline, log_linear, torch_generator
 from ..shared.splat_training import ShadedSplats, Start, one_per_triangle
-from ..shared.subject_mesh import BoundedCache, SubjectMesh, centroid_displacements
-from .config import RAMP_FROM, OursConfig
+from ..shared.surface_points import BoundedCache, SubjectMesh, centroid_displacements
 from .field import (
     COLOR_NETWORK,
     FIRST_LAYER,
+    RESIDUAL,
     CanonicalFrames,
     LocalSplats,
     apply_offsets,
@@ -38,7 +36,7 @@ from .field import (
     offset_layers,
     plane_box,
 )
-from .storage import RESIDUAL
+from .spec import RAMP_FROM, OursConfig
 
 FLOATS_PER_FACE = 17 + 9 + 1  # triangle frame, turn to canonical, penalty weight
 
@@ -230,12 +228,8 @@ def penalty_weights(
     Opacities of splats may change only if the expression moves the centroid of their triangle by more than a
     threshold. The face region and the rest have different thresholds and weights.
 
-    Parameters
-    ----------
-    unposed, canonical : Tensor
-        (V, 3) metres, with and without expression, jaw and eyes.
-    is_face : Tensor
-        (F,) triangles of the face region.
+    - ``unposed``, ``canonical``: (V, 3) metres, with and without expression, jaw and eyes.
+    - ``is_face``: (F,) triangles of the face region.
     """
     millimetres = 1000 * centroid_displacements(unposed, canonical, faces)
     still_face = (millimetres < config.penalty.face_mm).to(millimetres.dtype)

@@ -19,18 +19,17 @@ from ...bench.contracts import Changes, Clip, FloatArray, HeadPose
 from ...bench.native.dispatch import to_device
 from ..avatars.compact.layouts import read_coded, reduced
 from ..avatars.harmonics import DEGREE
-from ..ops.harmonics import C0, coefficient_count
-from ..ops.mesh import TriangleFrames
 from ..ops.photometric import photometric_loss
-from ..ops.splats import WorldSplats
+from ..ops.planes import C0, coefficient_count
+from ..ops.splats import TriangleFrames, WorldSplats
 from ..shared.loop import recomposited
-from ..shared.networks import initial_network, tracked_inputs
+from ..shared.optimisation import initial_network, tracked_inputs
 from ..shared.rendering import PlacedSplats, View, changes_of, pixel_sums, rasterize_view
 from ..shared.schedule import Batches, GroupedBatches, log_linear, numpy_generator
 from ..shared.splat_training import initial_shapes
 from ..shared.surface_splats import SurfaceAvatar, SurfaceMethod, SurfaceTrainer
-from .config import LOCAL, OFFICIAL_LEAST, RGBAvatarConfig
 from .model import PER_SPLAT, SHAPES, StoredShapes, blend_weights, blended, seen_colors
+from .spec import LOCAL, OFFICIAL_LEAST, RGBAvatarConfig
 from .spec import RGBAVATAR as SPEC
 
 GLOBAL = 1_000
@@ -46,14 +45,9 @@ class OnlineBatches(Batches):
     `LOCAL`, where newer ones are more probable. The global pool is a uniform sample of `GLOBAL` older images
     (reservoir sampling; Vitter, ACM TOMS 1985, algorithm R).
 
-    Parameters
-    ----------
-    order : Sequence[int]
-        Indices of the images in the order of their arrival.
-    size : int
-        Images of a batch, at most `LOCAL`; fewer before that many have arrived.
-    trained : int
-        Images trained on for each that arrives.
+    - ``order``: indices of the images in the order of their arrival.
+    - ``size``: images of a batch, at most `LOCAL`; fewer before that many have arrived.
+    - ``trained``: images trained on for each that arrives.
     """
 
     def __init__(self, order: Sequence[int], size: int, trained: int, seed: int):
@@ -98,10 +92,7 @@ class OnlineBatches(Batches):
 class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
     """A `Trainable`: neutral splats, grey and of equal size at first, their blendshapes, and the network of the weights.
 
-    Attributes
-    ----------
-    colored : Tensor
-        (N,) bool, splats with a colour initialised from images.
+    ``colored``: (N,) bool, splats with a colour initialised from images.
     """
 
     stored_class = StoredShapes

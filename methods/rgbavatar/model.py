@@ -10,12 +10,11 @@ from torch.nn.functional import linear
 
 from ...bench.configuration import build
 from ...bench.contracts import HeadAsset
-from ..ops.harmonics import C0
-from ..shared.networks import input_count, layer_names, layer_shapes, outputs_of
-from ..shared.subject_mesh import SubjectMesh
-from ..shared.surface_points import SurfacePoints
+from ..ops.planes import C0
+from ..shared.optimisation import input_count, layer_names, layer_shapes, outputs_of
+from ..shared.surface_points import SubjectMesh, SurfacePoints
 from ..shared.surface_splats import ChartSurface, PointSurface, SurfaceSplats
-from .config import RGBAvatarConfig
+from .spec import RGBAvatarConfig
 
 SHAPES = {"means": "mean_shapes", "quats": "quat_shapes", "colors": "color_shapes"}
 """Attributes that blendshapes change, and the names of their blendshapes."""
@@ -79,7 +78,7 @@ class StoredShapes(SurfaceSplats[RGBAvatarConfig]):
 
     @classmethod
     def settings_of(cls, path: Path, text: str) -> RGBAvatarConfig:
-        """Settings of a `text`. Raises `InputError`, naming ``path``, for other text."""
+        """Settings of a `text`."""
         inputs, _, variant = text.partition(FRAMES)
         values = {cls.KEY: inputs.split(","), "frame_variant": variant or "orthonormal"}
         return build(RGBAvatarConfig, values, str(path))

@@ -20,7 +20,7 @@ from ...bench.io.documents import parse_json, read_json
 from ...bench.io.files import atomic_path, digest, write_json
 from ...datasets.head.arrays import OPTIONAL, STORED, HeadArrays, read_head, save_head
 from .loop import Fit, TrainingSummary
-from .subject_mesh import SubjectMesh
+from .surface_points import SubjectMesh
 from .tensor_files import read_safetensors
 
 Content = TypeVar("Content")
@@ -87,7 +87,7 @@ def write_subject(path: Path, subject: Subject) -> None:
 
 
 def read_subject(path: Path, head: HeadAsset) -> Subject:
-    """Read what `write_subject` wrote. Raises `InputError` if it does not fit the head model."""
+    """Read what `write_subject` wrote."""
     members = {
         "name": TEXT,
         "head_model": TEXT,
@@ -121,14 +121,9 @@ def read_stored(
 ) -> ReadAvatar[Content]:
     """Read the coded file of a folder if there is one, else the file ``name`` and the subject written by training.
 
-    Parameters
-    ----------
-    content_of : Callable
-        Checks the tensors and the metadata of a file, and returns the content; its last argument is the head model.
-    read_coded : Callable
-        Subject, tensors and metadata of the coded file (`avatars.compact.layouts.read_coded`).
-
-    Raises `InputError` for damaged or incompatible files.
+    - ``content_of``: checks the tensors and the metadata of a file, and returns the content; its last argument is the head
+      model.
+    - ``read_coded``: subject, tensors and metadata of the coded file (`avatars.compact.layouts.read_coded`).
     """
     head, coded = read_shared_head(folder), folder / COMPACT_FILE
     if coded.exists():
@@ -161,10 +156,7 @@ class RefinedTracking:
     It applies only to the signal from which it was refined: subject, timestep and all tracked values must be equal, so
     held-out and foreign signals are never changed.
 
-    Parameters
-    ----------
-    tracked, refined : Mapping[str, FloatArray]
-        Arrays of `TRACKED` by name, (T, n) float32, rows in the order of ``timesteps``.
+    ``tracked``, ``refined``: arrays of `TRACKED` by name, (T, n) float32, rows in the order of ``timesteps``.
     """
 
     def __init__(

@@ -21,9 +21,9 @@ from ...bench.errors import InputError
 from ...bench.io.files import reading
 from ...bench.native.dispatch import is_cuda, pinned, to_device
 from ..splats.cpu import instruction_sets
-from .checkpoint import REMEDY, load_checkpoint, save_checkpoint
 from .optimisation import Optimiser
 from .schedule import Sampler, Timeline
+from .tensor_files import REMEDY, load_checkpoint, save_checkpoint
 from .threads import torch_on_one_thread
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -61,33 +61,26 @@ class Trainable(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Request to train a method.
-
-    Attributes
-    ----------
-    out : Path
-        Folder of the avatar, its checkpoint and its record.
-    run : str
-        Digest of everything that affects training; a checkpoint with another digest is refused.
-    clock : Callable
-        Clock in seconds with any origin, for budgets in seconds.
-    began : float | None
-        Reading of the clock before anything was prepared for the training, so that the preparation counts as training
-        time; by default counting begins with the first iteration.
-    capacity : Mapping[str, Any] | None
-        The planned sizes, for the record.
-    """
+    """Request to train a method."""
 
     clip: Clip
+
     out: Path
+    """Folder of the avatar, its checkpoint and its record."""
     budget: Budget
     device: str
     seed: int
     progress: Progress
+
     run: str
+    """Digest of everything that affects training; a checkpoint with another digest is refused."""
     clock: Callable[[], float] = time.monotonic
+    """Clock in seconds with any origin, for budgets in seconds."""
     began: float | None = None
+    """Reading of the clock before anything was prepared for the training, so that the preparation counts as training time; by
+    default counting begins with the first iteration."""
     capacity: Mapping[str, Any] | None = None
+    """The planned sizes, for the record."""
 
 
 @dataclass(frozen=True)
@@ -119,13 +112,9 @@ def train(
     uninterrupted one on the same machine, unless the budget is in seconds, where the number of iterations depends on
     the clock.
 
-    Parameters
-    ----------
-    published_length : int
-        Iterations of the published run (`Timeline`).
-    cost_growth : float
-        Estimated cost of a late step relative to an early one, to turn a budget in seconds into iterations; 1 for a
-        constant number of splats. The estimate is repeated after the parts `ESTIMATED_AGAIN` of the seconds.
+    - ``published_length``: iterations of the published run (`Timeline`).
+    - ``cost_growth``: estimated cost of a late step relative to an early one, to turn a budget in seconds into iterations; 1
+      for a constant number of splats. The estimate is repeated after the parts `ESTIMATED_AGAIN` of the seconds.
     """
     budget, clock = fit.budget, fit.clock
     check_budget(budget)
@@ -253,10 +242,7 @@ class TrainingImages:
 
     ``clip.image`` and ``clip.mask`` are called from a thread, one call at a time.
 
-    Parameters
-    ----------
-    masks : bool
-        Whether images have a fourth channel, the foreground coverage.
+    ``masks``: whether images have a fourth channel, the foreground coverage.
     """
 
     def __init__(

@@ -3,17 +3,46 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import logging
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
+import torch
+
 from ...bench.contracts import Budget, Clip, Progress
 from ...bench.machine import use_device
-from ..splats import cuda
+from ...bench.specs import Need
+from ..splats import cpu, cuda
 from .avatar_files import is_finished, run_digest
 from .capacity import CapacityPlan
 from .loop import CHECKPOINT, Fit, check_budget, check_training_split
+
+
+def splats(config: Any, device: str) -> Iterator[Need]:
+    """The splat renderer: its kernel on CPUs, gsplat on GPUs."""
+    if not device.startswith("cuda"):
+        yield cpu.KERNEL.need()
+        return
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
+    there = importlib.util.find_spec("gsplat") is not None
+    slow = f"{cuda.REMEDY} The slow reference backend is used instead."
+    yield Need("GPU", gpu, "PyTorch with CUDA, and an NVIDIA driver: https://pytorch.org/get-started.")
+    yield Need("gsplat", "installed" if there else "", slow, required=False)
+    if there and not cuda.compiled():
+        yield Need("CUDA toolkit", cuda.toolkit(), cuda.toolkit_remedy())
+
+
+def insta(config: Any, device: str) -> Iterator[Need]:
+    """INSTA's kernel and its device."""
+    from ..insta.kernel import KERNEL
+
+    if not device.startswith("cpu"):
+        yield Need(f"code for {device}", "", f"INSTA does not compute on {device!r}: run it with device=cpu.")
+    yield KERNEL.need()
+
 
 log = logging.getLogger(__name__)
 Config = TypeVar("Config")
@@ -65,7 +94,7 @@ class TrainedMethod(Generic[Config, Avatar]):
         load_optimisers()
 
     def _use(self, device: str) -> None:
-        """Prepare rendering on ``device``. Raises `InputError` if the method does not support it."""
+        """Prepare rendering on ``device``."""
         if self.draws_splats:
             cuda.prepare(device)
         else:

@@ -3,16 +3,118 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
+from ...bench.contracts import ByteArray, HeadAsset
 from ...bench.native.dispatch import to_device
-from ...datasets.head.rotations import quaternion_to_matrix
+from ...datasets.head.rotations import axis_angle_to_matrix, quaternion_to_matrix
+from ..ops.photometric import mean_ssim
 from .config import DensifiedTraining
 from .schedule import DensifySchedule, torch_generator
+
+ROTATIONS = ("neck", "jaw", "eyes")
+"""Names of the inputs that are rotations."""
+
+
+def tracked_inputs(arguments: Mapping[str, Tensor], names: Sequence[str]) -> Tensor:
+    """(T, I) inputs of a network: unchanged coefficients, and rotations as the first two rows of their matrices.
+
+    Eyelids are left out for a head model without them.
+    """
+    columns = []
+    for name in names:
+        values = arguments.get(name)
+        if values is not None and name in ROTATIONS:
+            values = axis_angle_to_matrix(values.unflatten(1, (-1, 3)))[:, :, :2].flatten(1)
+        columns += [] if values is None else [values]
+    return torch.cat(columns, dim=1)
+
+
+def input_count(head: HeadAsset, names: Sequence[str]) -> int:
+    """Number of `tracked_inputs` for a head model."""
+    lids = 0 if head.eyelid_basis is None else 2
+    sizes = {"expression": head.expression_basis.shape[2], "neck": 6, "jaw": 6, "eyes": 12, "eyelids": lids}
+    return sum({**sizes, "translation": 3}[name] for name in names)
+
+
+def layer_names(layers: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the weights and of the biases of a network."""
+    weights, biases = (
+        tuple(f"network_{part}_{layer}" for layer in range(layers)) for part in ("weight", "bias")
+    )
+    return weights, biases
+
+
+def layer_shapes(sizes: Sequence[int | str]) -> dict[str, tuple[int | str, ...]]:
+    """Shapes of weights and biases by name; ``sizes`` as for `initial_network`; unknown ones may be names."""
+    shapes: dict[str, tuple[int | str, ...]] = {}
+    for weight, bias, fan_in, fan_out in zip(*layer_names(len(sizes) - 1), sizes, sizes[1:]):
+        shapes |= {weight: (fan_out, fan_in), bias: (fan_out,)}
+    return shapes
+
+
+def outputs_of(network: Mapping[str, Tensor], sums: Tensor, layers: int) -> Tensor:
+    """Outputs of an MLP with ReLU, given the (N, H) pre-activations of its first layer."""
+    weights, biases = layer_names(layers)
+    for weight, bias in zip(weights[1:], biases[1:]):
+        sums = linear(sums.relu(), network[weight], network[bias])
+    return sums
+
+
+def initial_network(sizes: Sequence[int], seed: int) -> dict[str, Tensor]:
+    """Weights and biases by name, uniform in the inverse root of the layer's inputs, as `torch.nn.Linear` has them.
+
+    ``sizes``: number of inputs, widths of the hidden layers, number of outputs.
+    """
+    generator, tensors = torch_generator(seed, "network"), {}
+    for weight, bias, fan_in, fan_out in zip(*layer_names(len(sizes) - 1), sizes, sizes[1:]):
+        for name, shape in ((weight, (fan_out, fan_in)), (bias, (fan_out,))):
+            tensors[name] = (2 * torch.rand(shape, generator=generator) - 1) * fan_in**-0.5
+    return tensors
+
+
+def squared_error(picture: ByteArray, truth: ByteArray) -> float:
+    """Mean squared difference of two 8-bit images, in squared levels."""
+    return float(np.mean((picture.astype(np.float64) - truth) ** 2))
+
+
+def psnr(error: float) -> float:
+    """PSNR in dB for a mean squared difference of 8-bit images; infinite for 0."""
+    return math.inf if error == 0 else 10 * math.log10(255**2 / error)
+
+
+def picture_ssim(picture: ByteArray, truth: ByteArray) -> float:
+    """`mean_ssim` of two (H, W, 3) 8-bit images."""
+    planes = [torch.from_numpy(image.astype(np.float32) / 255).permute(2, 0, 1) for image in (picture, truth)]
+    return float(mean_ssim(*(image.contiguous() for image in planes)))
+
+
+def mean_over_visible(values: Tensor, visible: Tensor) -> Tensor:
+    """Mean of (N,) values where (N,) ``visible`` is true; 0 if there are none."""
+    weight = visible.to(values.dtype)
+    return (values * weight).sum() / weight.sum().clamp_min(1)
+
+
+def position_penalty(means: Tensor, visible: Tensor, threshold: float) -> Tensor:
+    """Mean over visible splats of the excess of (N, 3) local positions over the threshold (triangle sizes)."""
+    return mean_over_visible(F.relu(torch.linalg.vector_norm(means, dim=1) - threshold), visible)
+
+
+def scale_penalty(log_scales: Tensor, visible: Tensor, threshold: float) -> Tensor:
+    """Mean over visible splats of the norm of (N, 3) local scales' excess over the threshold.
+
+    The norm's gradient at zero is taken as 0.
+    """
+    excess = F.relu(log_scales.exp() - threshold)
+    return mean_over_visible(torch.linalg.vector_norm(excess, dim=1), visible)
+
 
 EPS = 1e-15
 
@@ -38,12 +140,8 @@ class Optimiser:
     zeros for new rows. A replaced parameter has no gradient, so it is not changed by the following step, as in the
     published code.
 
-    Parameters
-    ----------
-    betas : tuple[float, float]
-        Decay of the two moments.
-    epsilons : Mapping[str, float]
-        Epsilon by name; `EPS`, that of 3DGS, for all others.
+    - ``betas``: decay of the two moments.
+    - ``epsilons``: epsilon by name; `EPS`, that of 3DGS, for all others.
     """
 
     def __init__(
@@ -145,22 +243,14 @@ class Densifier:
     Per-splat parameters are the optimiser's groups ``names``; "means", "log_scales", "quats" and "opacities"
     (logits) must be among them.
 
-    Parameters
-    ----------
-    binding : Tensor
-        (N,) int64, triangle of each splat.
-    extent : float
-        Size of the scene, metres (`scene_extent`).
-    thresholds : Tensor | None
-        (F,) gradient above which splats are cloned or split, by triangle; None uses
-        ``settings.densify_gradient`` for all.
-    keep_last : bool
-        Whether the last splat of a triangle is never removed.
-    tables : tuple[str, ...]
-        Groups with any number of rows per splat, ordered by splat; splats on one triangle have the same number.
-        Children inherit them.
-    table_rows : Tensor | None
-        (F,) int64, number of rows in the tables for a splat on each triangle.
+    - ``binding``: (N,) int64, triangle of each splat.
+    - ``extent``: size of the scene, metres (`scene_extent`).
+    - ``thresholds``: (F,) gradient above which splats are cloned or split, by triangle; None uses ``settings.densify_gradient``
+      for all.
+    - ``keep_last``: whether the last splat of a triangle is never removed.
+    - ``tables``: groups with any number of rows per splat, ordered by splat; splats on one triangle have the same number.
+      Children inherit them.
+    - ``table_rows``: (F,) int64, number of rows in the tables for a splat on each triangle.
     """
 
     def __init__(
@@ -199,11 +289,7 @@ class Densifier:
     def run(self, iteration: int, schedule: DensifySchedule, face_sizes: Tensor) -> None:
         """Clone, split and prune, then reset the accumulated gradients.
 
-        Parameters
-        ----------
-        face_sizes : Tensor
-            (F,) triangle sizes of the current frame, metres, which convert local scales into
-            world scales.
+        ``face_sizes``: (F,) triangle sizes of the current frame, metres, which convert local scales into world scales.
         """
         gradient = self._gradient_sum / self._views.clamp_min(1)
         if self._thresholds is None:

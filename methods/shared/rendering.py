@@ -13,35 +13,28 @@ from torch import Tensor
 
 from ...bench.contracts import BoolArray, Camera, Changes, FloatArray, Frame, HeadPose, no_stage
 from ...bench.native.dispatch import is_cuda, on_host, to_device
-from ..avatars.compact.container import codec_of
+from ..avatars.compact.coder import codec_of
 from ..ops.splats import WorldSplats
 from ..splats import Rendering, pixel_weights, rasterize
-from ..splats.constants import ALPHA_MIN, TRANSMITTANCE_MIN
+from ..splats.request import ALPHA_MIN, TRANSMITTANCE_MIN
 from .avatar_files import HEAD_FILE
-from .subject_mesh import pose_key
+from .surface_points import pose_key
 
 Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, eq=False)
 class PosedSplats:
-    """Splats of one pose in the world, as numpy float32.
-
-    Attributes
-    ----------
-    means, quats, scales : FloatArray
-        (N, 3) metres, (N, 4) unit quaternions wxyz, (N, 3) metres.
-    opacities : FloatArray
-        (N,).
-    colors : FloatArray | None
-        (N, 3) as seen from the requested camera; None without a camera.
-    """
+    """Splats of one pose in the world, as numpy float32."""
 
     means: FloatArray
     quats: FloatArray
     scales: FloatArray
+    """(N, 3) metres, (N, 4) unit quaternions wxyz, (N, 3) metres."""
     opacities: FloatArray
+    """(N,)."""
     colors: FloatArray | None
+    """(N, 3) as seen from the requested camera; None without a camera."""
 
 
 class Cutoffs(NamedTuple):
@@ -247,12 +240,8 @@ class LastPose(Generic[Value]):
 class StoredSplatAvatar:
     """Base class of splat avatars.
 
-    Parameters
-    ----------
-    stored : Sequence[Path]
-        Files in the avatar's folder that count towards its size.
-    place : Callable
-        Returns the splats of a pose; calls its second argument with "drive" when the mesh is posed.
+    - ``stored``: files in the avatar's folder that count towards its size.
+    - ``place``: returns the splats of a pose; calls its second argument with "drive" when the mesh is posed.
     """
 
     def __init__(
@@ -280,7 +269,7 @@ class StoredSplatAvatar:
         return draw_splats(placed.world, placed.opacities, colors, view, end_stage, self._cutoffs)
 
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
-        """Render one frame. Raises `InputError` where the pose is of another head model."""
+        """Render one frame."""
         return read_back(self.draw(camera, pose, background))
 
     def read_back(self, drawn: Drawn) -> Frame:

@@ -21,10 +21,7 @@ from .config import DensifiedTraining, HarmonicsTraining
 class Timeline:
     """Maps iterations of the published run onto a run of ``total`` iterations, numbered from 1.
 
-    Parameters
-    ----------
-    published : int
-        Iterations of the run that the settings were written for.
+    ``published``: iterations of the run that the settings were written for.
     """
 
     total: int
@@ -143,10 +140,7 @@ class ShuffledEpochs:
 class Weighted:
     """Draws with replacement by probability. Iterations are numbered from 1.
 
-    Parameters
-    ----------
-    weights : Sequence[float] | np.ndarray
-        (n,) non-negative, at least one positive.
+    ``weights``: (n,) non-negative, at least one positive.
     """
 
     def __init__(self, weights: Sequence[float] | np.ndarray, seed: int):
@@ -191,14 +185,9 @@ class Batches:
 class GroupedBatches(Batches):
     """Each image once per epoch, in a new random order each epoch.
 
-    Parameters
-    ----------
-    groups : Sequence[int]
-        (n,) group of each image, such as its timestep.
-    size : int
-        Images of a batch; the last one of an epoch may have fewer.
-    together : int
-        Number of consecutive images from one group, if it has that many.
+    - ``groups``: (n,) group of each image, such as its timestep.
+    - ``size``: images of a batch; the last one of an epoch may have fewer.
+    - ``together``: number of consecutive images from one group, if it has that many.
     """
 
     def __init__(self, groups: Sequence[int], size: int, together: int, seed: int):

@@ -2,24 +2,105 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from ...bench.contracts import Camera, Clip, FloatArray
-from ..ops.mesh import TriangleFrames
+from ...bench.contracts import Camera, Clip, FloatArray, FrameKey
 from ..ops.photometric import photometric_loss
-from ..ops.splats import WorldSplats, unturned
+from ..ops.splats import TriangleFrames, WorldSplats, unturned
 from ..splats.request import Rendering
 from .config import DensifiedTraining, SplatSettings, SplatTraining
-from .image_training import ImageTrainer, Initial
-from .loop import COST_GROWTH
-from .losses import position_penalty, scale_penalty
-from .optimisation import Densifier, Optimiser, logit
-from .rendering import View, rasterize_view, scene_center, scene_extent
+from .loop import COST_GROWTH, Fit, TrainingImages, TrainingSummary, train
+from .optimisation import Densifier, Optimiser, OptimiserState, logit, position_penalty, scale_penalty
+from .rendering import View, rasterize_view, scene_center, scene_extent, view_of
 from .schedule import DensifySchedule, Sampler, Timeline, log_linear
+
+Initial = Mapping[str, tuple[Tensor, float]]
+"""Initial tensors and learning rates by name."""
+
+
+class ImageTrainer(OptimiserState):
+    """A `Trainable` except for its loss. A derived class calls `_optimise` in its initialiser.
+
+    - ``masks``: whether images have a fourth channel, the foreground coverage, if the clip has masks.
+    - ``keys``, ``cameras``: the training frames, in the order of the sampler's indices, and their cameras by name.
+    """
+
+    cost_growth: float = 1.0
+    """Cost of a late step relative to an early one, to convert a time budget into iterations."""
+
+    def __init__(
+        self, clip: Clip, settings: SplatSettings, sampler: Sampler, device: str, *, masks: bool = False
+    ):
+        self._settings, self._sampler, self._device = settings, sampler, device
+        self.keys: Sequence[FrameKey] = clip.splits["train"]
+        self._masked = masks and clip.mask(self.keys[0]) is not None
+        self._images = TrainingImages(clip, self.keys, sampler, device, masks=self._masked)
+        self.cameras = {key.camera: clip.cameras[key.camera] for key in self.keys}
+        self._views = {name: view_of(camera, device) for name, camera in self.cameras.items()}
+        self._background = torch.tensor(np.asarray(clip.background), dtype=torch.float32, device=device)
+
+    def _optimise(self, initial: Initial, epsilons: Mapping[str, float] = {}) -> None:
+        """Set the initial tensors, on the device of the training; ``epsilons`` as for `Optimiser`."""
+        self.optimiser = Optimiser(
+            {name: nn.Parameter(value.to(self._device)) for name, (value, _) in initial.items()},
+            {name: rate for name, (_, rate) in initial.items()},
+            epsilons=epsilons,
+        )
+        self._rates = {name: rate for name, (_, rate) in initial.items()}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The current tensors by name."""
+        return {name: self.optimiser[name] for name in self._rates}
+
+    def _decay_rates(self, iteration: int, apart: Collection[str] = ()) -> None:
+        """Set learning rates: the initial ones, falling to ``final_rate`` of them, log-linear over the last half of the run.
+
+        Those of the tensors in ``apart`` are not changed.
+        """
+        final = self._settings.final_rate
+        if final == 1:
+            return
+        decay = self._timeline.decay(iteration, final)
+        for name, rate in self._rates.items():
+            if name not in apart:
+                self.optimiser.set_learning_rate(name, decay * rate)
+
+    def begin(self, timeline: Timeline) -> None:
+        """Fit schedules to the length of the run."""
+        self._timeline = timeline
+
+    def loss(self, iteration: int, index: int) -> Tensor:
+        """Loss of one image."""
+        raise NotImplementedError
+
+    def after_backward(self, iteration: int) -> None:
+        """Set the learning rates; called between gradients and step."""
+        self._decay_rates(iteration)
+
+    def note(self) -> str:
+        """Short description of the state of training."""
+        return ""
+
+    def run(self, fit: Fit) -> TrainingSummary:
+        """Train to the end of the budget; see `train`."""
+        try:
+            return train(
+                *(self, self._sampler, fit),
+                published_length=self._settings.schedule_length,
+                checkpoint_every_s=self._settings.checkpoint_every_s,
+                cost_growth=self.cost_growth,
+            )
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Stop background work."""
+        self._images.close()
 
 
 def initial_shapes(sizes: FloatArray, settings: SplatSettings) -> dict[str, tuple[Tensor, float]]:
@@ -54,12 +135,8 @@ class SplatTrainer(ImageTrainer):
     ) -> None:
         """Set the initial tensors.
 
-        Parameters
-        ----------
-        splats, shared : Initial
-            Per-splat tensors, including "means", and all others.
-        binding, face_count, extent, seed, density : Tensor, int, float, int, Any
-            As for `Densifier`.
+        - ``splats``, ``shared``: per-splat tensors, including "means", and all others.
+        - ``binding``, ``face_count``, ``extent``, ``seed``, ``density``: as for `Densifier`.
         """
         initial = {**splats, **shared}
         self.splat_names, self.extent = tuple(splats), extent
@@ -116,10 +193,7 @@ class SplatTrainer(ImageTrainer):
     ) -> tuple[Rendering, Tensor]:
         """Rasterize and store data for densification; also returns (N,) whether a splat is visible.
 
-        Parameters
-        ----------
-        face_sizes : Tensor
-            (F,) metres per unit of the local scales, by triangle.
+        ``face_sizes``: (F,) metres per unit of the local scales, by triangle.
         """
         offset = opacities.new_zeros(len(opacities), 2).requires_grad_()
         rendering = rasterize_view(world, opacities, colors, view, self._background, means2d_offset=offset)
@@ -168,21 +242,14 @@ class Appearance(Protocol):
 
 
 class Start(NamedTuple):
-    """Initial splats with the size of their triangle.
-
-    Attributes
-    ----------
-    binding : Tensor
-        (N,) int64, the triangle of each splat; every triangle occurs at least once.
-    means : Tensor
-        (N, 3) in the triangles' frames, units of the triangle's size.
-    opacities : Tensor
-        (N,) in (0, 1).
-    """
+    """Initial splats with the size of their triangle."""
 
     binding: Tensor
+    """(N,) int64, the triangle of each splat; every triangle occurs at least once."""
     means: Tensor
+    """(N, 3) in the triangles' frames, units of the triangle's size."""
     opacities: Tensor
+    """(N,) in (0, 1)."""
 
 
 def one_per_triangle(face_count: int, opacity: float, device: str) -> Start:

@@ -17,18 +17,25 @@ from ...bench.contracts import Clip, HeadAsset, HeadPose
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
 from ...datasets.head.rotations import axis_angle_to_quaternion, matrix_to_quaternion, quaternion_to_matrix
-from ..ops.mesh import TriangleFrames, chart_axes
-from ..ops.splats import WorldSplats, apply_matrices, left_products, to_world
+from ..ops.splats import TriangleFrames, WorldSplats, apply_matrices, chart_axes, left_products, to_world
 from .avatar_files import AVATAR_FILE, Subject, clip_mesh, finish_fit, read_stored
 from .config import SurfaceSettings
-from .image_training import ImageTrainer
 from .loop import Fit
 from .method import TrainedMethod
-from .networks import input_count, tracked_inputs
+from .optimisation import input_count, tracked_inputs
 from .rendering import LastPose, PlacedSplats, StoredSplatAvatar
 from .schedule import Sampler
-from .subject_mesh import BoundedCache, SubjectMesh, TrainingPoses
-from .surface_points import MeshPoints, SurfacePoints, point_tensors, spread_points, take_points
+from .splat_training import ImageTrainer
+from .surface_points import (
+    BoundedCache,
+    MeshPoints,
+    SubjectMesh,
+    SurfacePoints,
+    TrainingPoses,
+    point_tensors,
+    spread_points,
+    take_points,
+)
 from .tensor_files import MAX_MAGNITUDE, check_sizes, check_tensors, write_tensors
 
 Settings = TypeVar("Settings")
@@ -39,10 +46,7 @@ Avatar = TypeVar("Avatar")
 class PointSurface:
     """Points on the mesh of a subject with local axes: those of the triangle, unless a subclass overrides them.
 
-    Attributes
-    ----------
-    rest : Tensor
-        (N, 3) points on the neutral mesh, metres.
+    ``rest``: (N, 3) points on the neutral mesh, metres.
     """
 
     def __init__(self, mesh: SubjectMesh, points: SurfacePoints):
@@ -115,22 +119,14 @@ class ChartSurface(PointSurface):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSplats(Generic[Settings]):
-    """Content of an avatar's file. A derived class describes the tensors and the text of the settings.
-
-    Attributes
-    ----------
-    tensors : dict[str, Tensor]
-        Those of `shapes`.
-    points : SurfacePoints
-        Surface point of each of the N splats.
-    settings : Settings
-        Further values that rendering needs.
-    """
+    """Content of an avatar's file. A derived class describes the tensors and the text of the settings."""
 
     tensors: dict[str, Tensor]
+    """Those of `shapes`."""
     points: SurfacePoints
+    """Surface point of each of the N splats."""
     settings: Settings
-
+    """Further values that rendering needs."""
     KEY: ClassVar[str]
     """Key of the settings in the file's metadata."""
 
@@ -151,11 +147,11 @@ class SurfaceSplats(Generic[Settings]):
 
     @classmethod
     def settings_of(cls, path: Path, text: str) -> Settings:
-        """Settings of a `text`. Raises `InputError`, naming ``path``, for other text."""
+        """Settings of a `text`."""
         raise NotImplementedError
 
     def checked(self, path: Path, head: HeadAsset, device: str) -> Self:
-        """The same on a device. Raises `InputError`, naming ``path``, where the tensors do not fit each other or the head."""
+        """The same on a device."""
         members = {name: Member("f", shape, MAX_MAGNITUDE, "f4") for name, shape in self.shapes(head).items()}
         check_tensors(path, self.tensors, members, {"N": len(self.points.triangles)})
         check_sizes(path, self.tensors["log_scales"])
@@ -169,7 +165,7 @@ class SurfaceSplats(Generic[Settings]):
     def of(
         cls, path: Path, tensors: dict[str, Tensor], metadata: Mapping[str, str], head: HeadAsset, device: str
     ) -> Self:
-        """Check the content of a file that `write` wrote. Raises `InputError` where a tensor is missing or does not fit."""
+        """Check the content of a file that `write` wrote."""
         settings = cls.settings_of(path, metadata.get(cls.KEY, ""))
         points = take_points(path, tensors, len(head.faces))
         return cls(tensors, points, settings).checked(path, head, device)
@@ -197,7 +193,7 @@ class SurfaceAvatar(StoredSplatAvatar, Generic[Stored]):
 
     @classmethod
     def read(cls, folder: Path, device: str) -> Self:
-        """Read an avatar from its folder. Raises `InputError` for damaged or incompatible files."""
+        """Read an avatar from its folder."""
         content_of = partial(cls.stored_class.of, device=device)
         return cls(*read_stored(folder, AVATAR_FILE, content_of, cls.read_coded), device)
 
@@ -215,17 +211,9 @@ class SurfaceAvatar(StoredSplatAvatar, Generic[Stored]):
 class SurfaceTrainer(ImageTrainer, Generic[Config]):
     """A `Trainable` except for its loss. A derived class calls `_optimise` in its initialiser.
 
-    Parameters
-    ----------
-    inputs : Sequence[str]
-        Tracked parameters that the network takes.
-    border : str
-        Region of the head model whose triangles get no texel of the chart.
-
-    Attributes
-    ----------
-    points, rest : SurfacePoints, FloatArray
-        Surface point of each splat, and its (N, 3) position on the neutral mesh, metres.
+    - ``inputs``: tracked parameters that the network takes.
+    - ``border``: region of the head model whose triangles get no texel of the chart.
+    - ``points``, ``rest``: surface point of each splat, and its (N, 3) position on the neutral mesh, metres.
     """
 
     stored_class: ClassVar[Any]

@@ -29,9 +29,8 @@ from torch.nn.functional import pad
 from ...bench.errors import UnavailableError, install_extra
 from ...bench.machine import use_device
 from ...bench.native.dispatch import is_cuda, is_float32, on_host
-from .constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 from .reference import published_radii
-from .request import Rendering, Request
+from .request import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Rendering, Request
 
 log = logging.getLogger(__name__)
 

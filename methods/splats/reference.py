@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from .constants import ALPHA_MAX, FRUSTUM_MARGIN, QUATERNION_MIN, RADIUS_MAX, TILE
-from .request import Rendering, Request
+from .request import ALPHA_MAX, FRUSTUM_MARGIN, QUATERNION_MIN, RADIUS_MAX, TILE, Rendering, Request
 
 CHUNK = 1024
 """Splats composited at once within a tile."""
@@ -242,11 +241,7 @@ def _pixel_centers(left: int, top: int, right: int, bottom: int) -> Tensor:
 
 
 def _composite_tile(
-    splats: Footprints,
-    colors: Tensor,
-    background: Tensor,
-    pixels: Tensor,
-    cut_offs: tuple[float, float],
+    splats: Footprints, colors: Tensor, background: Tensor, pixels: Tensor, cut_offs: tuple[float, float]
 ) -> Tensor:
     """Composite depth-sorted splats front to back onto ``pixels`` (P, 2); returns (P, C + 1), alpha last.
 

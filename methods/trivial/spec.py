@@ -9,15 +9,10 @@ from ...bench.specs import MethodSpec
 
 @dataclass(frozen=True)
 class NearestCameraConfig:
-    """Nearest training image.
-
-    Attributes
-    ----------
-    max_timesteps : int | None
-        Maximum number of stored timesteps, evenly spaced, which bounds the storage; None keeps all.
-    """
+    """Nearest training image."""
 
     max_timesteps: int | None = None
+    """Maximum number of stored timesteps, evenly spaced, which bounds the storage; None keeps all."""
 
 
 PRESETS = {name: {"budget": {"iterations": 1}} for name in ("smoke", "quick", "demo", "fast", "gpu", "paper")}
@@ -47,7 +42,7 @@ TEXTURED_MESH = MethodSpec(
     name="textured-mesh",
     default=True,
     summary="The posed mesh with the median colours of the training images: what tracking alone is worth.",
-    implementation="headbench.methods.trivial.textured_mesh:TexturedMesh",
+    implementation="headbench.methods.trivial.method:TexturedMesh",
     trivial=True,
     presets=PRESETS,
 )

@@ -69,9 +69,9 @@ def test_default_methods_decide_and_others_inform(capsys):
 
 
 def test_a_default_method_that_cannot_run_gives_no_verdict(monkeypatch):
-    from headbench.methods.shared import needs
+    from headbench.methods.shared import method
 
-    monkeypatch.setattr(needs, "splats", lambda config, device: [Need("a kernel", "", "Compile it.")])
+    monkeypatch.setattr(method, "splats", lambda config, device: [Need("a kernel", "", "Compile it.")])
     findings = doctor(DoctorSettings(), no_progress)
     assert (findings.passed, findings.code) == (False, 3)
     assert re.search("Cannot run here: .*ours", findings.text)

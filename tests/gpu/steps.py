@@ -20,8 +20,8 @@ from headbench.bench.doctor import take_turns
 from headbench.bench.machine import use_device
 from headbench.bench.registry import discover, resolve
 from headbench.bench.specs import MethodSpec
-from headbench.methods.benchmarks.scenes import SplatScene, head_shell, relative_error
-from headbench.methods.benchmarks.untrained import MemoryClip, untrained, with_images
+from headbench.methods.benchmarks.splats import SplatScene, head_shell, relative_error
+from headbench.methods.benchmarks.training import MemoryClip, untrained, with_images
 from headbench.methods.shared.loop import CHECKPOINT, synchroniser
 from headbench.methods.splats import cuda, rasterize
 from headbench.metrics.speed import SpeedProtocol, measure_speed

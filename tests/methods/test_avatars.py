@@ -10,24 +10,17 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from headbench.bench.contracts import (
-    STAGES,
-    Budget,
-    SharingAvatar,
-    StagedAvatar,
-    no_progress,
-)
+from headbench.bench.contracts import STAGES, Budget, SharingAvatar, StagedAvatar, no_progress
 from headbench.bench.errors import InputError
-from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.flashavatar.method import FlashAvatar
-from headbench.methods.ga.config import GAConfig
-from headbench.methods.ga.method import GA
-from headbench.methods.ga.storage import COLUMNS, read_ga_splats, write_ga_splats
-from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
+from headbench.methods.flashavatar.spec import FlashAvatarConfig
+from headbench.methods.ga.method import COLUMNS, GA, read_ga_splats, write_ga_splats
+from headbench.methods.ga.spec import GAConfig
 from headbench.methods.gbs.method import GBS
+from headbench.methods.gbs.spec import BlendshapeTraining, GBSConfig
 from headbench.methods.ours.method import Ours
-from headbench.methods.rgbavatar.config import RGBAvatarConfig
 from headbench.methods.rgbavatar.method import RGBAvatar
+from headbench.methods.rgbavatar.spec import RGBAvatarConfig
 from headbench.methods.shared.config import SplatTraining
 
 from .flashavatar.small import SMALL as SMALL_FLASHAVATAR

@@ -7,10 +7,10 @@ import pytest
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.datasets.head.arrays import read_head
-from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.flashavatar.method import FlashAvatar, FlashAvatarTraining
-from headbench.methods.rgbavatar.config import RGBAvatarConfig
+from headbench.methods.flashavatar.spec import FlashAvatarConfig
 from headbench.methods.rgbavatar.method import RGBAvatarTraining
+from headbench.methods.rgbavatar.spec import RGBAvatarConfig
 
 from .flashavatar.small import SMALL as FLASHAVATAR
 from .rgbavatar.small import SMALL as RGBAVATAR

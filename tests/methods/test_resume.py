@@ -5,19 +5,19 @@ from functools import cache
 import pytest
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.flashavatar.method import FlashAvatar
-from headbench.methods.ga.config import GAConfig
+from headbench.methods.flashavatar.spec import FlashAvatarConfig
 from headbench.methods.ga.method import GA
-from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
+from headbench.methods.ga.spec import GAConfig
 from headbench.methods.gbs.method import GBS
+from headbench.methods.gbs.spec import BlendshapeTraining, GBSConfig
 from headbench.methods.gha.mesh_training import FOLDER
 from headbench.methods.gha.method import GHA
-from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.method import Insta
+from headbench.methods.insta.spec import InstaConfig
 from headbench.methods.ours.method import Ours
-from headbench.methods.rgbavatar.config import RGBAvatarConfig
 from headbench.methods.rgbavatar.method import RGBAvatar
+from headbench.methods.rgbavatar.spec import RGBAvatarConfig
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.loop import CHECKPOINT
 from headbench.methods.shared.optimisation import Optimiser

@@ -15,20 +15,13 @@ from headbench.bench.engine.config import (
 )
 from headbench.bench.errors import InputError
 from headbench.bench.registry import resolve
-from headbench.methods.flashavatar.config import FlashAvatarConfig
-from headbench.methods.flashavatar.spec import FLASHAVATAR
-from headbench.methods.ga.config import GAConfig
-from headbench.methods.ga.spec import GA
-from headbench.methods.gbs.config import GBSConfig
-from headbench.methods.gbs.spec import GBS
-from headbench.methods.gha.config import GHAConfig
-from headbench.methods.gha.spec import GHA
-from headbench.methods.insta.config import InstaConfig
-from headbench.methods.insta.spec import INSTA
-from headbench.methods.ours.config import Lines, OursConfig, OuterLayers, Penalty, Planes, PlannedCapacity
-from headbench.methods.ours.spec import OURS
-from headbench.methods.rgbavatar.config import RGBAvatarConfig
-from headbench.methods.rgbavatar.spec import RGBAVATAR
+from headbench.methods.flashavatar.spec import FLASHAVATAR, FlashAvatarConfig
+from headbench.methods.ga.spec import GA, GAConfig
+from headbench.methods.gbs.spec import GBS, GBSConfig
+from headbench.methods.gha.spec import GHA, GHAConfig
+from headbench.methods.insta.spec import INSTA, InstaConfig
+from headbench.methods.ours.spec import OURS, Lines, OursConfig, OuterLayers, Penalty, Planes, PlannedCapacity
+from headbench.methods.rgbavatar.spec import RGBAVATAR, RGBAvatarConfig
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, Timeline
 from headbench.methods.trivial.spec import MEAN_IMAGE, NEAREST_CAMERA, TEXTURED_MESH

@@ -13,7 +13,7 @@ from headbench.bench.experiments import viewpoints
 from headbench.bench.io.files import digest
 from headbench.datasets.head.arrays import HeadArrays
 from headbench.methods.ops.splats import to_world
-from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.shared.surface_points import SubjectMesh
 from headbench.methods.splats import rasterize
 
 

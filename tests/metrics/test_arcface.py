@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.metrics.arcface import PLACES, ArcFace, alignment, five_points
+from headbench.metrics.csim import PLACES, ArcFace, alignment, five_points
 
 RNG = np.random.default_rng(0)
 WEIGHTS, BIAS = RNG.normal(size=(3, 512)).astype(np.float32), RNG.normal(size=512).astype(np.float32)

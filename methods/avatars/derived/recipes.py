@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -13,15 +13,37 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from ....bench.contracts import Avatar, Camera, Clip, HeadPose, SplatAvatar, Variant
+from ....bench.contracts import Avatar, Camera, Clip, HeadAsset, HeadPose, SplatAvatar, Variant
 from ....bench.engine.config import CODED
 from ....bench.io.files import write_bytes
-from ...ours.field import PLANES
-from ...shared.avatar_files import read_shared_head
+from ...ga.method import BINDING, PLY_FILE, GAAvatar, read_ga_splats, write_ga_splats
+from ...ops.planes import coefficient_count
+from ...ours.field import (
+    DYNAMIC,
+    FIELD_FILE,
+    PER_SPLAT,
+    PLANES,
+    StoredField,
+    field_of,
+    read_field,
+    save_field,
+)
+from ...ours.method import OursAvatar
+from ...shared.avatar_files import (
+    COMPACT_FILE,
+    SUBJECT_FILE,
+    Subject,
+    read_shared_head,
+    read_subject,
+    save_shared_head,
+    write_subject,
+)
 from ...shared.rendering import USUAL, Cutoffs
+from ...shared.surface_points import SubjectMesh
 from ...shared.tensor_files import read_safetensors
-from ..compact.precision import Precision
-from ..views import contribution
+from ..compact.codecs import parts_of, write_coded
+from ..harmonics import contribution, training_views
+from ..settings import Precision
 
 STEPS = (1.0, 0.25, 0.5, 2.0, 4.0)
 """Factors of all quantisation steps."""
@@ -45,8 +67,8 @@ def _variants(module: str, name: str, folder: Path, clip: Clip, device: str) -> 
         yield Variant(coded_name(step), coded_summary(step), make)
 
 
-gbs_variants = partial(_variants, "gbs.avatar", "GBSAvatar")
-gha_variants = partial(_variants, "gha.avatar", "GHAAvatar")
+gbs_variants = partial(_variants, "gbs.method", "GBSAvatar")
+gha_variants = partial(_variants, "gha.method", "GHAAvatar")
 insta_variants = partial(_variants, "insta.avatar", "InstaAvatar")
 rgbavatar_variants = partial(_variants, "rgbavatar.method", "RGBAvatarAvatar")
 flashavatar_variants = partial(_variants, "flashavatar.method", "FlashAvatarAvatar")
@@ -76,27 +98,21 @@ EARLIER = Cutoffs(4 / 255, 1e-2)
 
 @dataclass(frozen=True)
 class Recipe:
-    """Changes of an avatar, applied in this order; None and 1 change nothing.
-
-    Attributes
-    ----------
-    splats : float
-        Fraction of the splats that are kept: those that contribute most to training views.
-    planes, lines : int | None
-        Samples along a side of a plane, along a line.
-    cutoffs : Cutoffs
-        Thresholds of the renderer.
-    step : float
-        Factor of all quantisation steps of a coded avatar.
-    """
+    """Changes of an avatar, applied in this order; None and 1 change nothing."""
 
     splats: float = 1.0
+    """Fraction of the splats that are kept: those that contribute most to training views."""
     degree: int | None = None
+
     planes: int | None = None
     lines: int | None = None
+    """Samples along a side of a plane, along a line."""
     storage: Storage = "exact"
+
     cutoffs: Cutoffs = USUAL
+    """Thresholds of the renderer."""
     step: float = 1.0
+    """Factor of all quantisation steps of a coded avatar."""
 
     @property
     def name(self) -> str:
@@ -247,3 +263,131 @@ def fitting_matrix(samples: int, fewer: int) -> Tensor:
     nodes = torch.arange(fewer, dtype=torch.float64)
     interpolation = (1 - (places[:, None] - nodes).abs()).clamp_min(0)
     return torch.linalg.pinv(interpolation)
+
+
+REDUCED_FILE = "splats.safetensors"
+
+
+def ga_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
+    """The variants of `recipes.GA`. All variants use the tracking refined in training."""
+    whole, head = GAAvatar.read(folder, device), read_shared_head(folder)
+    weights = cache(lambda: contributions(whole, training_views(clip)))
+    for recipe in GA:
+        yield Variant(
+            recipe.name, recipe.summary, partial(_make_ga, whole, head, clip, weights, recipe, device)
+        )
+
+
+def _make_ga(
+    whole: GAAvatar,
+    head: HeadAsset,
+    clip: Clip,
+    weights: Callable[[], Tensor],
+    recipe: Recipe,
+    device: str,
+    out: Path,
+) -> GAAvatar:
+    """Write an avatar reduced by a recipe; return the avatar that is read back."""
+    rows = kept_rows(weights, recipe.splats, len(whole.binding)).to(device)
+    splats = {name: value.index_select(0, rows) for name, value in whole.splat_tensors.items()}
+    binding = whole.binding.index_select(0, rows)
+    if recipe.degree is not None:
+        splats["sh_rest"] = splats["sh_rest"][:, :, : coefficient_count(recipe.degree) - 1].contiguous()
+    save_shared_head(out, head)
+    subject: Subject = whole.subject
+    stored = [out / COMPACT_FILE]
+    if recipe.storage == "coded":
+        reduced = GAAvatar([], whole.mesh, subject, splats, binding, whole.refined, device)
+        write_coded(parts_of(reduced, head, clip), head, out, Precision(step=recipe.step), None)
+        coded = GAAvatar.read(out, device)
+        subject, splats, binding = coded.subject, coded.splat_tensors, coded.binding
+    else:
+        write_subject(out / SUBJECT_FILE, subject)
+        subject = read_subject(out / SUBJECT_FILE, head)
+        if recipe.storage == "exact":
+            path = out / PLY_FILE
+            write_ga_splats(path, splats, binding)
+            splats, binding = read_ga_splats(path, len(head.faces), device)
+        else:
+            path = out / REDUCED_FILE
+            tensors = {**splats, "opacities": splats["opacities"][:, None], BINDING: binding.to(torch.int32)}
+            write_reduced(path, tensors, recipe.storage)
+            splats = {name: value.to(device) for name, value in read_reduced(path).items()}
+            binding = splats.pop(BINDING).to(torch.int64)
+            splats["opacities"] = splats["opacities"][:, 0]
+        stored = [path, out / SUBJECT_FILE]
+    mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
+    return GAAvatar(stored, mesh, subject, splats, binding, whole.refined, device, recipe.cutoffs)
+
+
+EXACT_PARTS = ("plane_box", "line_box", "jaw_bases")
+TRIANGLES = "triangles"
+_ANY = 1 << 30  # no reduction
+
+
+def ours_variants(folder: Path, clip: Clip, device: str) -> Iterator[Variant]:
+    """The variants of `recipes.OURS` that change this avatar."""
+    whole = OursAvatar.read(folder, device)
+    head = read_shared_head(folder)
+    weights = cache(lambda: contributions(whole, training_views(clip)))
+    for recipe in OURS:
+        if _idle(recipe, whole.field):
+            continue
+        yield Variant(
+            recipe.name, recipe.summary, partial(_make_ours, whole, head, clip, weights, recipe, device)
+        )
+
+
+def _idle(recipe: Recipe, field: StoredField) -> bool:
+    """Whether a recipe only reduces samples of planes or lines, and the avatar has no more samples than that."""
+    if replace(recipe, planes=None, lines=None) != Recipe():
+        return False
+    changed = _resampled(field.tensors, recipe)
+    return all(changed[name] is value for name, value in field.tensors.items())
+
+
+def _resampled(tensors: dict[str, Tensor], recipe: Recipe) -> dict[str, Tensor]:
+    return coarser_lines(coarser_planes(tensors, recipe.planes or _ANY), recipe.lines or _ANY)
+
+
+def _make_ours(
+    whole: OursAvatar,
+    head: HeadAsset,
+    clip: Clip,
+    weights: Callable[[], Tensor],
+    recipe: Recipe,
+    device: str,
+    out: Path,
+) -> OursAvatar:
+    """Write an avatar reduced by a recipe; return the avatar that is read back."""
+    rows = kept_rows(weights, recipe.splats, len(whole.field.tensors["splats"])).to(device)
+    tensors = dict(whole.field.tensors)
+    for name in PER_SPLAT:
+        if name in tensors:
+            tensors[name] = tensors[name].index_select(0, rows)
+    tensors = _resampled(tensors, recipe)
+    field = StoredField(tensors, whole.field.dynamic)
+    save_shared_head(out, head)
+    subject, stored = whole.subject, [out / COMPACT_FILE]
+    if recipe.storage == "coded":
+        reduced = OursAvatar([], whole.mesh, subject, field, device)
+        write_coded(parts_of(reduced, head, clip), head, out, Precision(step=recipe.step), None)
+        coded = OursAvatar.read(out, device)
+        subject, field = coded.subject, coded.field
+    else:
+        write_subject(out / SUBJECT_FILE, subject)
+        path = out / FIELD_FILE
+        if recipe.storage == "exact":
+            save_field(path, field)
+            field = read_field(path, head, device)
+        else:
+            table, triangles = tensors["splats"][:, :-1], tensors["splats"][:, -1]
+            narrow = {**tensors, "splats": table, TRIANGLES: triangles.to(torch.int32)}
+            write_reduced(path, narrow, recipe.storage, EXACT_PARTS)
+            read = read_reduced(path)
+            triangles = read.pop(TRIANGLES)[:, None].to(torch.float32)
+            read["splats"] = torch.cat([read["splats"], triangles], dim=1)
+            field = field_of(path, read, {DYNAMIC: ",".join(field.dynamic)}, head, device)
+        stored = [path, out / SUBJECT_FILE]
+    mesh = SubjectMesh(head, subject.shape, subject.static_offset, device)
+    return OursAvatar(stored, mesh, subject, field, device, recipe.cutoffs)

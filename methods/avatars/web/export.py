@@ -34,10 +34,9 @@ from ...shared.rendering import view_of
 from ...splats import rasterize
 from ...splats.reference import rotation_matrices
 from ..export import neutral_pose, open_splats
-from ..views import direction_of, orbit_camera
-from .bake import Source, bake
-from .model import JOINTS, Moved, Slider, WebAvatar
-from .settings import ExportHtmlSettings
+from ..harmonics import direction_of, orbit_camera
+from ..settings import ExportHtmlSettings
+from .bake import JOINTS, Moved, Slider, Source, WebAvatar, bake
 
 FORMAT = 1
 LOWEST_LOG_SCALE = -14.0

@@ -21,23 +21,15 @@ from ....datasets.head.arrays import faces_in_region
 from ....datasets.head.subject import PosedSubject
 from ....datasets.head.teeth import with_teeth_where_possible
 from ....datasets.images import write_image
-from ...gbs.config import BlendshapeTraining, GBSConfig
+from ...gbs.spec import BlendshapeTraining, GBSConfig
 from ...shared.avatar_files import SUBJECT_FILE, Subject, head_arrays
 from ...shared.loop import Fit
 from ...shared.schedule import DensifySchedule, Timeline
 from ..checkout import Checkout, Repository
-from ..config import GBSOfficialConfig, option_words
-from ..ga.export import check_mark, mark
-from ..ga.head_files import (
-    OfficialHead,
-    obj_text,
-    padding_remarks,
-    pickled,
-    write_landmarks,
-)
-from ..ga.method import RENDERED, TRAINED
+from ..ga.head_files import OfficialHead, obj_text, padding_remarks, pickled, write_landmarks
+from ..ga.method import RENDERED, TRAINED, check_mark, mark
 from ..method import OfficialMethod, read_identity
-from ..spec import GBS_OFFICIAL
+from ..spec import GBS_OFFICIAL, GBSOfficialConfig, option_words
 from ..video import (
     at_rest,
     check_masks,
@@ -219,7 +211,6 @@ for path in sys.argv[1:]:
     torch.save((kept, iteration), path)
 """
 """Removes the optimiser's state, two thirds of their size, from checkpoints, since their renderer ignores it."""
-
 WITHOUT_FIX = "2952da7d246e5790140dbb477d1468214564f092"
 """The commit that the adapter was written for, from before the authors' fix of June 2025."""
 

@@ -6,32 +6,289 @@ instant-ngp. It takes a scene and a configuration, trains, records the frames of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ....bench.contracts import Clip, FrameKey, HeadAsset, Progress
-from ....bench.io.files import read_bytes, write_bytes, write_json
+import numpy as np
+
+from ....bench.contracts import (
+    ByteArray,
+    Camera,
+    Clip,
+    FloatArray,
+    FrameKey,
+    HeadAsset,
+    HeadPose,
+    IntArray,
+    Progress,
+)
+from ....bench.errors import InputError
+from ....bench.io.files import read_bytes, write_bytes, write_json, write_text
+from ....datasets.head.subject import BATCH, PosedSubject, pose_in_head_frame
+from ....datasets.images import write_image
+from ...insta.marching import bare_triangles, mouth_triangles
+from ...insta.spec import InstaConfig
 from ...shared.avatar_files import SUBJECT_FILE, Subject
 from ...shared.loop import Fit
+from ...shared.surface_points import pose_key
 from ..checkout import Checkout, Environment, Repository, inspect_program
-from ..config import INSTAOfficialConfig
-from ..ga.windows import cameras_of
-from ..in_parts import PartsMethod, RenderCall
+from ..ga.head_files import cameras_of, read_obj, without_teeth
 from ..method import read_identity
-from ..spec import INSTA_OFFICIAL
-from ..video import check_masks, check_no_skew
-from ..workplace import Listed, Workplace, copy_file
-from .export import (
-    CONDITIONS,
-    MASK_FOLDER,
-    MASKS,
-    PART,
-    TEST,
-    VideoMesh,
-    write_list,
-    write_training,
+from ..spec import INSTA_OFFICIAL, INSTAOfficialConfig
+from ..video import (
+    PartsMethod,
+    RenderCall,
+    VisibleMesh,
+    at_rest,
+    check_masks,
+    check_no_skew,
+    in_parts,
+    straight_rgba,
+    training_frames,
 )
+from ..workplace import Listed, Workplace, copy_file, write_placeholder
+
+MASKS: Mapping[str, tuple[str, ...]] = {
+    "lips": ("lips", "mouth_socket"),
+    "right_ear": ("right_ear",),
+    "left_ear": ("left_ear",),
+    "eye_region": ("eye_region",),
+    "boundary": ("boundary",),
+    "face": ("face",),
+}
+"""Their meshes that mark a region by red vertices, and regions of the head; a vertex of several belongs to the
+first."""
+MASK_FOLDER = "mesh_masks"
+SKIN, MOUTH, HAIR = 250, 140, 80
+"""Classes of pixels: losses of the mouth have a larger weight, and classes up to 90 have no depth loss."""
+CONDITIONS = 16
+"""Expression coefficients that the network reads; their program assumes that a file has as many."""
+REACH = 0.45
+"""Maximum distance of vertices from the head's origin, metres: their scene is a cube of one metre, with a margin
+around the head."""
+MILLIMETRES, FARTHEST = 1000, 65_535
+TRAIN, TEST, CANONICAL = "transforms_train.json", "transforms_test.json", "canonical.obj"
+PLACEHOLDER = "images/placeholder.png"
+PART = 1000
+"""Maximum number of frames in one call, since all their meshes are in GPU memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class VideoMesh:
+    """A head model and one identity for their program: meshes without teeth, with the static offset."""
+
+    head: HeadAsset
+    posed: PosedSubject
+    """The clip's own, with teeth if it has them."""
+    kept: IntArray
+    """(V',) vertices of their mesh."""
+    faces: IntArray
+    """(F', 3) triangles in their numbering."""
+    masks: Mapping[str, bytes]
+    """Files of regions, by name."""
+    is_flames: bool
+    """Whether vertices are FLAME's, so that triangles and regions are the official ones."""
+
+    @classmethod
+    def of(cls, subject: Subject, head: HeadAsset, checkout: Checkout) -> VideoMesh:
+        """Raises `InputError` for a head outside their scene."""
+        posed = PosedSubject(head, subject.shape, subject.static_offset)
+        kept, faces = without_teeth(head)
+        farthest = float(np.abs(posed.neutral[kept]).max())
+        if farthest > REACH:
+            expected = f"vertices within {REACH} m of the origin along each axis, as FLAME's are"
+            raise InputError(f"head model {head.version!r}", "template", expected, f"{farthest:.3g} m")
+        files = {
+            name: read_bytes(checkout.folder / MASK_FOLDER / f"{name}.obj", "an OBJ file") for name in MASKS
+        }
+        vertices, theirs = read_obj(checkout.folder / MASK_FOLDER / "lips.obj")
+        if vertices == len(kept) and len(theirs) and 0 <= theirs.min() and theirs.max() < len(kept):
+            return cls(head, posed, kept, theirs, files, True)
+        return cls(head, posed, kept, faces, _masks(head, kept, faces, posed.neutral), False)
+
+    def write_masks(self, folder: Path) -> None:
+        """Write the files of regions below the program's working directory."""
+        for name, content in self.masks.items():
+            write_bytes(folder / MASK_FOLDER / f"{name}.obj", content)
+
+    def write_canonical(self, folder: Path) -> None:
+        """Write the canonical mesh: no expression, with the jaw opened as by the tracker."""
+        rest, still = np.zeros(3), np.zeros(self.head.expression_basis.shape[2])
+        jaw = np.array([InstaConfig().jaw_opening, 0.0, 0.0])
+        pose = HeadPose(self.head.version, still, rest, rest, jaw, np.zeros(6), rest)
+        self.write(folder / CANONICAL, self.posed.meshes([pose])[0])
+
+    def write(self, path: Path, vertices: FloatArray) -> None:
+        """Write a mesh of the clip's head."""
+        write_text(path, _vertices(vertices[self.kept]) + _triangles(self.faces))
+
+    def write_poses(self, folder: Path, poses: Mapping[str, HeadPose]) -> None:
+        """Write mesh and expression of each frame, by the frame's name; equal poses are written once and linked."""
+        at_rest = {name: pose_in_head_frame(pose) for name, pose in poses.items()}
+        first: dict[bytes, str] = {}
+        for name, pose in at_rest.items():
+            first.setdefault(pose_key(pose), name)
+        written = [*first.values()]
+        for start in range(0, len(written), BATCH):
+            names = written[start : start + BATCH]
+            for name, mesh in zip(names, self.posed.meshes([at_rest[name] for name in names])):
+                self.write(folder / mesh_name(name), mesh)
+        for name, pose in at_rest.items():
+            values = np.zeros(max(CONDITIONS, len(pose.expression)))
+            values[: len(pose.expression)] = pose.expression
+            write_text(folder / expression_name(name), "".join(f"{value:.8f}\n" for value in values))
+            source = first[pose_key(pose)]
+            if source != name:
+                (folder / mesh_name(name)).symlink_to(Path(mesh_name(source)).name)
+
+
+def _vertices(vertices: FloatArray, colours: IntArray | None = None) -> str:
+    rows = vertices if colours is None else np.hstack([vertices, colours])
+    line = "v" + " {:.8g}" * rows.shape[1] + "\n"
+    return "".join(line.format(*row) for row in rows.tolist())
+
+
+def _triangles(faces: IntArray) -> str:
+    return "".join("f {} {} {}\n".format(*face) for face in (faces + 1).tolist())
+
+
+def _masks(head: HeadAsset, kept: IntArray, faces: IntArray, neutral: FloatArray) -> dict[str, bytes]:
+    """Meshes whose red vertices are a region's."""
+    taken = np.zeros(len(head.template), bool)
+    files = {}
+    for name, regions in MASKS.items():
+        inside = np.zeros(len(head.template), bool)
+        for region in regions:
+            inside[np.asarray(head.regions.get(region, ()), dtype=np.int64)] = True
+        inside &= ~taken
+        taken |= inside
+        colours = np.where(inside[kept, None], [1, 0, 0], [0, 0, 1])
+        files[name] = (_vertices(neutral[kept], colours) + _triangles(faces)).encode()
+    return files
+
+
+def mesh_name(name: str) -> str:
+    """Path of a frame's mesh; their program orders frames by these names."""
+    return f"meshes/{name}.obj"
+
+
+def expression_name(name: str) -> str:
+    """Path of a frame's expression coefficients."""
+    return f"flame/exp/{name}.txt"
+
+
+def frame_name(number: int) -> str:
+    """Name of a frame in a folder; names sort by number."""
+    return f"{number:06d}"
+
+
+def write_training(clip: Clip, head: VideoMesh, work: Workplace, progress: Progress) -> dict[str, FrameKey]:
+    """Write the training frames, and a placeholder as the split that their program renders at the end.
+
+    The placeholder has an image of one pixel, and pose and camera of the first training frame. Depths and classes of
+    pixels are those of the mesh instead of those of a tracker and a face parsing network. Returns the key of every
+    other image by its path.
+    """
+    frames = training_frames(clip, head.posed)
+    surfaces = _Surfaces(head)
+    images: dict[str, FrameKey] = {}
+    records = []
+    head.write_canonical(work.input)
+    head.write_poses(work.input, {frame_name(frame.number): frame.pose for frame in frames})
+    for frame in frames:
+        name, pixels = frame_name(frame.number), straight_rgba(clip, frame.key)
+        classes, depth = surfaces.seen(frame.pose, frame.camera, pixels[..., 3])
+        for part, image in (("images", pixels), ("seg_mask", classes), ("depth", depth)):
+            write_image(work.input / f"{part}/{name}.png", image)
+            images[f"input/{part}/{name}.png"] = frame.key
+        parts = {"depth_path": f"depth/{name}.png", "seg_mask_path": f"seg_mask/{name}.png"}
+        records.append({**record(name, frame.camera, f"images/{name}.png"), **parts})
+        progress(frame.number + 1, len(frames), "exporting")
+    write_placeholder(work.input / PLACEHOLDER)
+    shared = {**intrinsics(frames[0].camera), "integer_depth_scale": 1 / MILLIMETRES}
+    write_json(work.input / TRAIN, {**shared, "frames": records})
+    last = record(frame_name(0), frames[0].camera, PLACEHOLDER)
+    write_json(work.input / TEST, {**shared, "frames": [last]})
+    return images
+
+
+class _Surfaces:
+    """Classes of pixels and depths by the mesh visible in a clip's frames."""
+
+    def __init__(self, head: VideoMesh):
+        self._mesh = VisibleMesh(head.head, head.posed)
+        mouth, bare = mouth_triangles(head.head).numpy(), bare_triangles(head.head).numpy()
+        self._classes = np.select([mouth, bare], [MOUTH, SKIN], HAIR).astype(np.uint8)
+
+    def seen(self, pose: HeadPose, camera: Camera, coverage: ByteArray) -> tuple[ByteArray, np.ndarray]:
+        """(H, W, 3) class in the red channel and (H, W) uint16 depth, millimetres along the axis; 0 for background.
+
+        Covered pixels beside the mesh are hair.
+        """
+        found = self._mesh.seen(pose, camera, coverage)
+        classes = np.zeros((*coverage.shape, 3), np.uint8)
+        classes[found.rows, found.columns, 0] = np.where(
+            found.hit, self._classes[found.triangles.clip(0)], HAIR
+        )
+        depth = np.zeros(coverage.shape, np.uint16)
+        millimetres = np.rint(np.where(found.hit, MILLIMETRES * found.depths, 0))
+        depth[found.rows, found.columns] = millimetres.clip(0, FARTHEST)
+        return classes, depth
+
+
+def record(name: str, camera: Camera, image: str, *, height: int | None = None) -> dict[str, Any]:
+    """A frame of their JSON, its camera in the head's frame.
+
+    ``height`` is the height of the image if it differs from the camera's: their program takes focal lengths relative
+    to it.
+    """
+    return {
+        "transform_matrix": np.linalg.inv(np.asarray(camera.world_to_camera, np.float64)).tolist(),
+        "file_path": image,
+        "mesh_path": mesh_name(name),
+        "exp_path": expression_name(name),
+        **intrinsics(camera, (height or camera.height) / camera.height),
+    }
+
+
+def intrinsics(camera: Camera, scale: float = 1.0) -> dict[str, float]:
+    """Size, focal lengths times ``scale`` and principal point, pixels; the last is read as a fraction of the size."""
+    K = np.asarray(camera.K, np.float64)
+    return {
+        "w": float(camera.width),
+        "h": float(camera.height),
+        "fl_x": scale * float(K[0, 0]),
+        "fl_y": scale * float(K[1, 1]),
+        "cx": float(K[0, 2]),
+        "cy": float(K[1, 2]),
+    }
+
+
+def write_list(frames: Sequence[Listed], head: VideoMesh, work: Workplace) -> list[dict[str, Any]]:
+    """Write frames to render, in folders of one image size and at most `PART` frames each; return a list of the
+    folders.
+
+    Each entry has ``folder``, ``width``, ``height`` and the ``numbers`` of its frames in order. Images have one pixel:
+    rendering reads none, and their program would keep all of them in GPU memory.
+    """
+    for frame in frames:
+        check_no_skew(frame.camera)
+    parts: list[dict[str, Any]] = []
+    for part in in_parts(frames, lambda frame: (frame.camera.width, frame.camera.height), PART):
+        folder = f"part_{len(parts):04d}"
+        cameras = [frame.camera for frame in at_rest(head.posed, part)]
+        names = [frame_name(index) for index in range(len(part))]
+        head.write_canonical(work.input / folder)
+        head.write_poses(work.input / folder, dict(zip(names, (frame.pose for frame in part))))
+        write_placeholder(work.input / folder / PLACEHOLDER)
+        records = [record(n, c, PLACEHOLDER, height=1) for n, c in zip(names, cameras)]
+        write_json(work.input / folder / TEST, {"frames": records})
+        size = {"width": cameras[0].width, "height": cameras[0].height}
+        parts.append({"folder": folder, **size, "numbers": [frame.number for frame in part]})
+    return parts
+
 
 CONFIGS, MAIN, OURS = Path("configs/nerf"), "main.json", "headbench.json"
 INPUT, EXPERIMENTS = "../input", "experiments"

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import Any
+from typing import Any, Literal
 
-from scipy.stats import t as student_t
+import tyro
 
 from ....bench.condition import Condition, Named, label_of
 from ....bench.configuration import build
@@ -23,22 +23,90 @@ from ....bench.engine.run import run
 from ....bench.engine.store import RunFolder
 from ....bench.engine.stored import TRAINING_FILE
 from ....bench.errors import InputError
-from ....bench.executors.settings import check_executor
+from ....bench.executors.settings import ExecutionOptions, check_executor
 from ....bench.io.documents import read_json
 from ....bench.io.files import write_json, write_text
 from ....bench.io.lock import locked
+from ....bench.options import DependentOptions
 from ....bench.progress import log_to_file
 from ....bench.registry import get
 from ....bench.rows import FULL, Rows
 from ....bench.specs import CommandResult, command
-from ...flashavatar.config import FlashAvatarConfig
-from ...rgbavatar.config import RGBAvatarConfig
+from ...flashavatar.spec import FlashAvatarConfig
+from ...rgbavatar.spec import RGBAvatarConfig
 from ...shared.config import PAPER_ITERATIONS, SplatTraining
-from ...shared.schedule import DensifySchedule, Timeline
-from ..flashavatar.method import SPLATS
-from ..method import TRAINING_LOG
-from ..rgbavatar.method import PLY_FILE
-from .settings import ParitySettings
+
+WITHOUT_PERCEPTUAL_LOSS = 15_000
+"""Iterations up to which the authors' code of FlashAvatar has no perceptual loss, which the native method never has."""
+
+
+@dataclass(frozen=True)
+class ParitySettings(ExecutionOptions):
+    """Trains both on one capture with the published settings for a run of this length and the same image in each iteration, and
+    scores all renders by one implementation of the metrics. This is repeated with other orders of the images, since the order
+    itself changes results by half a decibel. Writes parity.md, parity.json and the run. The same command continues a run that
+    was killed. Exit code 1: the mean PSNR over orders differs by more than the tolerance, or a training failed.
+    """
+
+    method: tyro.conf.Positional[Literal["flashavatar", "ga", "gbs", "ours", "rgbavatar"]]
+    """The native method. The authors' code of method ours is TensorialGaussianAvatar (`tga-official`)."""
+    checkout: str
+    """Folder of a checkout of the authors' repository; it is not changed."""
+    out: str
+    """Folder to write."""
+    data: str | None = None
+    """Capture to train on, of one subject or several. Default: a synthetic one is made in OUT/capture, of --subjects heads, SIZE, with
+    --cameras and --timesteps."""
+    head: str | None = None
+    """Head model of captures that do not contain one: FLAME pickle or npz."""
+    iterations: int = 1_000
+    """Length of each training; with rgbavatar, steps of ten images."""
+    orders: int = 5
+    """Number of orders of the images, each with one training of either method. A single order on one capture gives no interval."""
+    device: Literal["cuda", "cpu-shim"] = "cuda"
+    """Device of the authors' code: CUDA, or headbench's CPU renderer instead of its rasteriser
+    (docs/explanation/methods/official.md), which shows differences of training and head model, not of the rasterisers."""
+    python: str = ""
+    """Interpreter for the authors' code, as settings.ga-official.python of `headbench run`. Default with cpu-shim: this one."""
+    commit: str | None = None
+    """Expected commit; default: the one that the adapter was written for; "" accepts any."""
+    frames: int | None = None
+    """Held-out frames scored for each task, evenly spread; default: all."""
+    tolerance: float = 0.3
+    """Difference of PSNR, in decibels, within which the two count as equivalent; also the limit of the mean difference."""
+    samples: int | None = None
+    """Number of splats on the head. gbs: initial number, 5,000 by default; published: 50,000, whose differences for each expression
+    take gigabytes. flashavatar: 13,500 by default, as published; others only on heads of another topology than FLAME's.
+    rgbavatar: the same, 60,000 by default."""
+    subjects: int = 2
+    """Heads of the synthetic capture; both methods are trained on each with every order."""
+    size: str = "96x136"
+    """Width x height of the synthetic capture's images in pixels."""
+    cameras: int = 8
+    """Views of the synthetic capture, including the held-out one."""
+    timesteps: int = 24
+    """Timesteps of the synthetic capture."""
+    dependent = (
+        DependentOptions(("subjects", "size", "cameras", "timesteps"), "data", False),
+        DependentOptions(("samples",), "method", ("flashavatar", "gbs", "rgbavatar")),
+    )
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for invalid settings."""
+        parse_size(self.size)
+        if self.method == "flashavatar" and self.iterations > WITHOUT_PERCEPTUAL_LOSS:
+            raise ValueError(
+                f"iterations must be at most {WITHOUT_PERCEPTUAL_LOSS} with flashavatar, as the native method has no perceptual loss"
+            )
+        if (
+            min(self.iterations, self.orders, self.subjects) < 1
+            or (self.samples is not None and self.samples < 10)
+            or not self.tolerance > 0
+        ):
+            raise ValueError(
+                "iterations, orders and subjects must be at least 1, samples 10, the tolerance above 0"
+            )
+
 
 OFFICIAL = {
     "flashavatar": "flashavatar-official",
@@ -100,25 +168,20 @@ OPTIONS = ("checkout", "python", "commit", "device")
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference of one metric in one task, official minus native, over orders.
-
-    Attributes
-    ----------
-    pairs : tuple[tuple[str, int], ...]
-        Subjects and orders for which both methods have complete results.
-    native, official : tuple[float, ...]
-        Mean over frames, then sequences, for each pair.
-    half_width : float | None
-        Half width of its 95 % interval (Student's t over pairs); None with a single pair.
-    """
+    """Difference of one metric in one task, official minus native, over orders."""
 
     task: str
     metric: str
+
     pairs: tuple[tuple[str, int], ...]
+    """Subjects and orders for which both methods have complete results."""
     native: tuple[float, ...]
     official: tuple[float, ...]
+    """Mean over frames, then sequences, for each pair."""
     difference: float
+
     half_width: float | None
+    """Half width of its 95 % interval (Student's t over pairs); None with a single pair."""
 
     def equivalence_p(self, margin: float) -> float | None:
         """P-value of two one-sided t-tests over pairs against differences of the margin and beyond; None with a single pair.
@@ -126,14 +189,16 @@ class Difference:
         D. Schuirmann, Journal of Pharmacokinetics and Biopharmaceutics 15, 1987. It is at most 5 % where the 90 % interval lies within
         the margin. Orders on one capture are treated as independent of each other.
         """
-        apart = [b - a for a, b in zip(self.native, self.official, strict=True)]
-        if len(apart) < 2:
+        from scipy.stats import t as student_t
+
+        differences = [b - a for a, b in zip(self.native, self.official, strict=True)]
+        if len(differences) < 2:
             return None
-        error = stdev(apart) / math.sqrt(len(apart))
+        error = stdev(differences) / math.sqrt(len(differences))
         distance = margin - abs(self.difference)
         if error == 0.0:
             return 0.0 if distance > 0 else 1.0
-        return float(student_t.sf(distance / error, len(apart) - 1))
+        return float(student_t.sf(distance / error, len(differences) - 1))
 
 
 @command("run parity", group="compare", writes="out", kinds=("captures",))
@@ -143,12 +208,12 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
     config = run_config(settings, out)
     check_executor(settings.execution, config.device)
     try:
-        found = resolve_cells(config)
-        check_settings(found)
+        methods = resolve_cells(config)
+        check_settings(methods)
     except InputError as error:
         raise _with_options(error, OFFICIAL[settings.method]) from error
-    native, official = (method.spec.name for method, _ in found)
-    condition = found[0][1].name
+    native, official = (method.spec.name for method, _ in methods)
+    condition = methods[0][1].name
     with log_to_file(out / "parity.log"):
         if settings.data is None:
             _make_capture(settings, out, progress)
@@ -178,8 +243,8 @@ def compare(settings: ParitySettings, progress: Progress = no_progress) -> Comma
         "run": "run",
     }
     write_json(out / "parity.json", data)
-    apart = [d for d in differences if d.metric == "psnr" and abs(d.difference) > settings.tolerance]
-    return CommandResult(text, data, bool(differences) and not apart and not rows.failed)
+    too_far = any(d.metric == "psnr" and abs(d.difference) > settings.tolerance for d in differences)
+    return CommandResult(text, data, bool(differences) and not too_far and not rows.failed)
 
 
 def _with_options(error: InputError, official: str) -> InputError:
@@ -251,6 +316,8 @@ def as_theirs(native: str, iterations: int, samples: int) -> dict[str, Any]:
     if native == "gbs":
         errors = {"correctives_variant": "official", "lower_teeth_variant": "official"}
         return {"min_sh_every": 1_000, "samples": samples, "teeth_samples": samples // 10, **errors}
+    from ...shared.schedule import DensifySchedule, Timeline
+
     timeline = Timeline(iterations, PAPER_ITERATIONS)
     schedule = DensifySchedule.of(SplatTraining(), timeline, white=True)
     assert schedule.reset_every is not None
@@ -265,7 +332,7 @@ def differences_of(
     rows: Rows, native: str, official: str, orders: Sequence[int], condition: str = ""
 ) -> list[Difference]:
     """Differences by task and metric, over the subjects and orders for which both have values under a condition."""
-    found = []
+    results = []
     for task in TASKS:
         for metric in METRICS:
             of_native, of_official = (
@@ -274,12 +341,11 @@ def differences_of(
             both = sorted(pair for pair in of_native.keys() & of_official.keys() if pair[1] in orders)
             if not both:
                 continue
-            apart = [of_official[pair] - of_native[pair] for pair in both]
+            differences = [of_official[pair] - of_native[pair] for pair in both]
             ours, theirs = (tuple(of[pair] for pair in both) for of in (of_native, of_official))
-            found.append(
-                Difference(task, metric, tuple(both), ours, theirs, fmean(apart), _half_width(apart))
-            )
-    return found
+            mean, half_width = fmean(differences), _half_width(differences)
+            results.append(Difference(task, metric, tuple(both), ours, theirs, mean, half_width))
+    return results
 
 
 def _means(rows: Rows, method: str, task: str, metric: str, condition: str) -> dict[tuple[str, int], float]:
@@ -297,6 +363,8 @@ def _means(rows: Rows, method: str, task: str, metric: str, condition: str) -> d
 def _half_width(values: Sequence[float]) -> float | None:
     if len(values) < 2:
         return None
+    from scipy.stats import t as student_t
+
     quantile = float(student_t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1))
     return quantile * stdev(values) / math.sqrt(len(values))
 
@@ -336,6 +404,10 @@ def _cells(run_folder: RunFolder, rows: Rows, method: str, orders: Sequence[int]
 
 def _splats(folder: Path) -> int | None:
     """Number of splats in an avatar's PLY file, or from FlashAvatar's log; None without both."""
+    from ..flashavatar.method import SPLATS
+    from ..method import TRAINING_LOG
+    from ..rgbavatar.method import PLY_FILE
+
     plys, log = [folder / name for name in ("point_cloud.ply", PLY_FILE)], folder / TRAINING_LOG
     path = next((ply for ply in plys if ply.is_file()), None)
     if path is None:

@@ -18,26 +18,27 @@ from ....bench.contracts import Clip, FloatArray, FrameKey, HeadAsset, Progress
 from ....bench.errors import InputError
 from ....bench.io.arrays import read_npy, read_npz
 from ....bench.io.files import read_bytes, write_bytes, write_text
-from ...rgbavatar.config import RGBAvatarConfig
+from ...rgbavatar.spec import RGBAvatarConfig
 from ...shared.avatar_files import SUBJECT_FILE, Subject, read_shared_head
 from ...shared.loop import Fit
 from ...shared.schedule import GroupedBatches, Timeline
 from ...shared.surface_points import chart_resolution, texel_points
 from ..checkout import Checkout, Repository
-from ..config import RGBAvatarOfficialConfig
-from ..ga.head_files import OfficialHead, SparseMatrix, padding_remarks, pickled
-from ..ga.windows import cameras_of
-from ..in_parts import PartsMethod, RenderCall, in_parts, same_intrinsics
+from ..ga.head_files import OfficialHead, SparseMatrix, cameras_of, padding_remarks, pickled
 from ..method import read_identity
-from ..spec import RGBAVATAR_OFFICIAL
+from ..spec import RGBAVATAR_OFFICIAL, RGBAvatarOfficialConfig
 from ..video import (
     FlameSubject,
+    PartsMethod,
+    RenderCall,
     at_rest,
     check_masks,
     check_no_skew,
     check_one_camera,
     frame_name,
     image_name,
+    in_parts,
+    same_intrinsics,
     write_torch,
     write_video,
 )
@@ -55,7 +56,7 @@ def has_their_topology(head: HeadAsset, checkout: Checkout) -> bool:
 
 
 def chart_of(head: HeadAsset) -> FloatArray:
-    """(F, 3, 2) float64 texture coordinates of a head. Raises `InputError` if it has none."""
+    """(F, 3, 2) float64 texture coordinates of a head."""
     uv = getattr(head, "uv", None)
     if uv is None:
         remedy = (

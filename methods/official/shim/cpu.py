@@ -12,19 +12,242 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from types import ModuleType
-from typing import Any
+from types import ModuleType, SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 import PIL.Image
 import torch
 import torch.utils.data
 from scipy.spatial import KDTree
-from torch import Tensor
+from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from . import blended, blendshapes, meshes, rasterizer
-from .unused import OF_FLASHAVATAR, REPLACED, Silent
+from ...ops.planes import C0, harmonic_colors
+from ...splats import pixel_weights, rasterize
+from . import blendshapes
+from .blendshapes import OF_FLASHAVATAR, REPLACED, Mesh, Silent, rasterize_meshes
+
+NEAR = 0.2
+"""Metres; nearer splats are not drawn, as published."""
+
+
+class GaussianRasterizationSettings(NamedTuple):
+    """The published settings; matrices multiply row vectors from the right. ``prefiltered`` and ``debug`` have no effect."""
+
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool
+    debug: bool = False
+
+
+class GaussianRasterizer(nn.Module):
+    """The published module."""
+
+    def __init__(self, raster_settings: GaussianRasterizationSettings):
+        super().__init__()
+        self.raster_settings = raster_settings
+
+    def forward(
+        self,
+        means3D: Tensor,
+        means2D: Tensor,
+        opacities: Tensor,
+        shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
+        alpha_point_id: int | None = None,
+    ) -> tuple[Tensor, ...]:
+        """Render (N,) splats.
+
+        - ``means3D``, ``scales``, ``rotations``: (N, 3), (N, 3), (N, 4) wxyz; metres.
+        - ``means2D``: (N, 3) values that do not affect the image. Their gradient is the one with respect to the projected means
+          in normalised device units, with a zero third column.
+        - ``opacities``: (N, 1) or (N,) in [0, 1].
+        - ``shs``, ``colors_precomp``: (N, K, 3) harmonics of which ``sh_degree`` are used, or (N, 3) colours; exactly one of
+          them.
+        - ``alpha_point_id``: argument of GaussianBlendshapes' fork; 0 also returns the coverage by all splats.
+        - Returns image (3, H, W); coverage (H, W) if requested; radii (N,), positive for every splat in view, regardless of its
+          opacity.
+        """
+        to = self.raster_settings
+        if (shs is None) == (colors_precomp is None):
+            raise ValueError("expected either shs or colors_precomp")
+        if cov3D_precomp is not None or scales is None or rotations is None:
+            raise ValueError("expected scales and rotations; the shim does not support covariances")
+        if alpha_point_id not in (None, 0):
+            raise ValueError("expected alpha_point_id 0; the shim supports only the coverage by all splats")
+        if shs is not None:
+            colors_precomp = _colors(shs, means3D - to.campos, to.sh_degree)
+        assert colors_precomp is not None
+        width, height = int(to.image_width), int(to.image_height)
+        # The value of means2D has no effect: the difference is zero, its gradient is not.
+        half = means3D.new_tensor([0.5 * width, 0.5 * height])
+        offset = (means2D - means2D.detach())[:, :2] * half
+        rendering = rasterize(
+            *(means3D, rotations, to.scale_modifier * scales, opacities.reshape(-1), colors_precomp),
+            *(to.viewmatrix.detach().T, self.intrinsics(), width, height),
+            background=to.bg,
+            near=NEAR,
+            means2d_offset=offset,
+            check_values=False,
+        )
+        image = rendering.image.permute(2, 0, 1)
+        return (
+            (image, rendering.radii) if alpha_point_id is None else (image, rendering.alpha, rendering.radii)
+        )
+
+    def intrinsics(self) -> Tensor:
+        """(3, 3): the principal point is the middle of the image."""
+        width, height = float(self.raster_settings.image_width), float(self.raster_settings.image_height)
+        focal = width / (2 * self.raster_settings.tanfovx), height / (2 * self.raster_settings.tanfovy)
+        return torch.tensor([[focal[0], 0, width / 2], [0, focal[1], height / 2], [0, 0, 1]])
+
+    def markVisible(self, positions: Tensor) -> Tensor:
+        """(N,) whether positions are beyond the near plane."""
+        view = self.raster_settings.viewmatrix
+        return positions @ view[:3, 2] + view[3, 2] > NEAR
+
+
+def _colors(shs: Tensor, vectors: Tensor, degree: int) -> Tensor:
+    """(N, 3) colours of harmonics along (N, 3) vectors from the camera."""
+    if degree == 0:
+        return torch.relu(0.5 + C0 * shs[:, 0])
+    return harmonic_colors(shs[:, 0].contiguous(), shs[:, 1:].transpose(1, 2).contiguous(), vectors, degree)
+
+
+PUBLIC: dict[str, Any] = {
+    "GaussianRasterizationSettings": GaussianRasterizationSettings,
+    "GaussianRasterizer": GaussianRasterizer,
+}
+
+
+LEAST_WEIGHT = 0.1
+"""Weights of a splat in a pixel up to this do not count, as published (``forward.cu``, ``renderCUDA``)."""
+LEAST_COVERAGE = 0.5
+"""Pixels of the target image with a coverage up to this do not count, as published (the same)."""
+
+
+class Settings(SimpleNamespace):
+    """The published settings by name, see `GaussianRasterizationSettings`; ``bg`` is set for every batch."""
+
+
+class TargetRasterizer(GaussianRasterizer):
+    """The published module for one image."""
+
+    raster_settings: Any
+
+    def forward(self, target_image: Tensor | None = None, **splats: Any) -> tuple[Tensor, ...]:  # type: ignore[override]
+        """Render splats.
+
+        - ``target_image``: (4, H, W) straight colours and coverage in [0, 1]; none if it is empty.
+        - ``splats``: those of `GaussianRasterizer.forward`, by name.
+        - Returns image (3, H, W), coverage (1, H, W), sums over pixels of weight times target colour (N, 3) and of weight (N,),
+          and radii (N,).
+        """
+        image, alpha, radii = super().forward(**splats, alpha_point_id=0)
+        sums = image.new_zeros(len(radii), 4)
+        if target_image is not None and target_image.numel():
+            self._add_sums(sums, target_image, **splats)
+        return image, alpha[None], sums[:, :3], sums[:, 3], radii
+
+    def intrinsics(self) -> Tensor:
+        """(3, 3) with the principal point of the projection matrix."""
+        to = self.raster_settings
+        projection = (torch.linalg.inv(to.viewmatrix.double()) @ to.projmatrix.double()).T
+        width, height = to.image_width, to.image_height
+        focal = projection[0, 0] * width / 2, projection[1, 1] * height / 2
+        center = (projection[0, 2] + 1) * width / 2, (projection[1, 2] + 1) * height / 2
+        return torch.tensor([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
+
+    @torch.no_grad()
+    def _add_sums(
+        self,
+        sums: Tensor,
+        target: Tensor,
+        means3D: Tensor,
+        rotations: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        **rest: Any,
+    ) -> None:
+        to = self.raster_settings
+        shapes = means3D, rotations, to.scale_modifier * scales, opacities.reshape(-1)
+        camera = to.viewmatrix.T, self.intrinsics().to(means3D), to.image_width, to.image_height
+        splats, pixels, weights = pixel_weights(*shapes, *camera, NEAR)
+        colors, coverage = target[:3].flatten(1).T, target[3].flatten()
+        counted = (weights > LEAST_WEIGHT) & (coverage[pixels] > LEAST_COVERAGE)
+        weights, splats, pixels = weights[counted, None], splats[counted], pixels[counted]
+        sums.index_add_(0, splats, torch.cat([weights * colors[pixels], weights], dim=1))
+
+
+class BatchRasterizer(nn.Module):
+    """The published module for images of one camera: every argument and result has a leading axis of images."""
+
+    def __init__(self, max_gaussian_size: int, max_batch_size: int, raster_settings: Settings):
+        super().__init__()
+        self.raster_settings = raster_settings
+
+    def forward(self, **batch: Tensor) -> tuple[Tensor, ...]:
+        """Render every image on its own background; see `TargetRasterizer.forward`."""
+        found = []
+        for index, ground in enumerate(self.raster_settings.bg.reshape(-1, 3)):
+            settings: Any = Settings(**{**vars(self.raster_settings), "bg": ground})
+            one = TargetRasterizer(settings)
+            found.append(one(**{name: values[index] for name, values in batch.items()}))
+        return tuple(torch.stack(parts) for parts in zip(*found, strict=True))
+
+
+def rasterize_chart(
+    context: Any, pos: Tensor, tri: Tensor, resolution: tuple[int, int]
+) -> tuple[Tensor, None]:
+    """nvdiffrast's ``rasterize`` for a flat mesh in a square: the triangle at the centre of each texel, the lowest row first.
+
+    Of several triangles in a texel the first is taken.
+
+    - ``pos``, ``tri``: (1, V, 4) clip coordinates with w = 1; (F, 3) triangles.
+    - ``resolution``: texels of both sides, S and S.
+    - Returns (1, S, S, 4): first two barycentric coordinates, z, and the number of the triangle from 1, all 0 without a
+      triangle.
+    """
+    if resolution[0] != resolution[1]:
+        raise ValueError("expected a square; the shim does not support other charts")
+    # PyTorch3D's coordinates, which `rasterize_meshes` takes, point the other way along both sides.
+    turned = torch.cat([-pos[..., :2], pos[..., 2:3]], dim=-1)
+    triangles, z, barycentric, _ = rasterize_meshes(Mesh(turned, tri[None].long()), resolution[0])
+    found = torch.cat([barycentric[..., 0, :2], z, triangles + 1.0], dim=-1)
+    return found * (triangles >= 0), None
+
+
+RASTERIZER: dict[str, Any] = {
+    "GaussianRasterizationSettings": Settings,
+    "GaussianRasterizer": TargetRasterizer,
+    "BatchGaussianRasterizer": BatchRasterizer,
+}
+OF_BLENDED: dict[str, dict[str, Any]] = {
+    "torch.utils.tensorboard": {"SummaryWriter": Silent},
+    "fused_ssim": {"fused_ssim": None},
+}
+"""Stand-in modules for packages that are not installed, by name."""
+ALWAYS: dict[str, dict[str, Any]] = {
+    **REPLACED,
+    "nvdiffrast": {},
+    "nvdiffrast.torch": {
+        **dict.fromkeys(("RasterizeCudaContext", "RasterizeGLContext"), Silent),
+        "rasterize": rasterize_chart,
+    },
+}
+"""Stand-ins used even if the package is installed: nvdiffrast needs CUDA or OpenGL."""
 
 
 def install(threads: int, code: str) -> None:
@@ -34,15 +257,15 @@ def install(threads: int, code: str) -> None:
     optionally must stay missing, so stand-ins are limited to the required ones.
     """
     torch.set_num_threads(threads)
-    own = blended.RASTERIZER if code == "blended splats" else {}
-    _module("diff_gaussian_rasterization", rasterizer.PUBLIC | blendshapes.RASTERIZER | own)
+    own = RASTERIZER if code == "blended splats" else {}
+    _module("diff_gaussian_rasterization", PUBLIC | blendshapes.RASTERIZER | own)
     _module("diff_gaussian_rasterization._C", blendshapes.RASTERIZER_KERNELS)
     _module("simple_knn")
     _module("simple_knn._C", {"distCUDA2": mean_square_distances, **blendshapes.NEIGHBOURS})
     packages = {
-        "blendshapes": blendshapes.PACKAGES,
-        "charted splats": {**meshes.PACKAGES, **OF_FLASHAVATAR},
-        "blended splats": blended.PACKAGES,
+        "blendshapes": blendshapes.OF_BLENDSHAPES,
+        "charted splats": {**blendshapes.OF_MESHES, **OF_FLASHAVATAR},
+        "blended splats": OF_BLENDED,
     }
     # Imported by scripts, but not used: no mesh is drawn, no external OBJ file read and no LPIPS measured.
     context = dict.fromkeys(("RasterizeCudaContext", "RasterizeGLContext"), Silent)
@@ -59,7 +282,7 @@ def install(threads: int, code: str) -> None:
     for name, content in unused.items():
         if not _is_installed(name):
             _module(name, content)
-    for name, content in {"charted splats": REPLACED, "blended splats": blended.ALWAYS}.get(code, {}).items():
+    for name, content in {"charted splats": REPLACED, "blended splats": ALWAYS}.get(code, {}).items():
         _module(name, content)
     _without_cuda()
     _signed_images()

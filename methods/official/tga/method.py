@@ -22,7 +22,6 @@ from ...shared.config import PAPER_ITERATIONS
 from ...shared.loop import Fit
 from ...shared.schedule import Timeline
 from ..checkout import Checkout, Repository
-from ..config import TGAOfficialConfig
 from ..ga.head_files import OfficialHead
 from ..ga.method import (
     ARGUMENTS_FILE,
@@ -33,7 +32,7 @@ from ..ga.method import (
     TEETH_VERTICES,
     GALayoutMethod,
 )
-from ..spec import TGA_OFFICIAL
+from ..spec import TGA_OFFICIAL, TGAOfficialConfig
 from ..workplace import Listed, Patch, Workplace, copy_file
 
 JAW_FILE, CLUSTER_FILE = "sorted_jaw_poses.npz", "train_cluster_16.npz"

@@ -27,8 +27,8 @@ from headbench.bench.io.images import (
 )
 from headbench.bench.io.provenance import COMPOSITE, RENDER, SYNTHETIC, note
 from headbench.datasets.images import read_image, read_mask, write_image
-from headbench.methods.avatars.formats import STANDARD
-from headbench.methods.shared.ply import read_ply, write_ply
+from headbench.methods.avatars.export import STANDARD
+from headbench.methods.shared.tensor_files import read_ply, write_ply
 
 TERMS = "http://cv.iptc.org/newscodes/digitalsourcetype/"
 

@@ -14,7 +14,7 @@ from headbench.datasets.head.arrays import save_head
 from headbench.methods.avatars.import_ga import import_avatar
 from headbench.methods.avatars.settings import ImportGASettings
 from headbench.methods.ga.method import GA
-from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.shared.surface_points import SubjectMesh
 
 from ...datasets.tiny_capture import write_tiny_capture
 

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.engine.config import resolve_method
 from headbench.bench.errors import InputError
-from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.flashavatar.method import FlashAvatar, FlashAvatarTraining, image_loss
 from headbench.methods.flashavatar.model import (
     INPUTS,
@@ -22,12 +21,11 @@ from headbench.methods.flashavatar.model import (
     network_outputs,
     network_sizes,
 )
-from headbench.methods.flashavatar.spec import FLASHAVATAR
+from headbench.methods.flashavatar.spec import FLASHAVATAR, FlashAvatarConfig
 from headbench.methods.official.video import six_numbers
-from headbench.methods.ops.harmonics import C0, sh_basis
-from headbench.methods.ops.planes import encode
+from headbench.methods.ops.planes import C0, encode, sh_basis
 from headbench.methods.shared.avatar_files import clip_mesh
-from headbench.methods.shared.networks import initial_network, input_count, layer_names, tracked_inputs
+from headbench.methods.shared.optimisation import initial_network, input_count, layer_names, tracked_inputs
 from headbench.methods.shared.tensor_files import read_safetensors
 
 from ...datasets.head.toy import toy_head

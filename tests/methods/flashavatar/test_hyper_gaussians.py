@@ -10,17 +10,19 @@ from safetensors.torch import save_file
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.methods.avatars.compact.codecs import parts_of, write_coded
-from headbench.methods.avatars.compact.precision import EXACT, Precision
-from headbench.methods.flashavatar.config import FlashAvatarConfig
-from headbench.methods.flashavatar.hyper_gaussians import (
+from headbench.methods.avatars.settings import EXACT, Precision
+from headbench.methods.flashavatar.method import FlashAvatar, FlashAvatarTraining
+from headbench.methods.flashavatar.model import (
     WIDTHS,
+    TrainedSplats,
     conditional_means,
     gaussian_names,
     gaussian_shapes,
     initial_gaussians,
+    layer_of_points,
+    network_outputs,
 )
-from headbench.methods.flashavatar.method import FlashAvatar, FlashAvatarTraining
-from headbench.methods.flashavatar.model import TrainedSplats, layer_of_points, network_outputs
+from headbench.methods.flashavatar.spec import FlashAvatarConfig
 from headbench.methods.shared.schedule import Timeline
 from headbench.methods.shared.tensor_files import read_safetensors
 

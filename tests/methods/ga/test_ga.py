@@ -5,14 +5,14 @@ import pytest
 import torch
 from torch import nn
 
-from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GAAppearance, GAAvatar
-from headbench.methods.ops.harmonics import C0, C1
+from headbench.methods.ga.spec import GAConfig
+from headbench.methods.ops.planes import C0, C1
 from headbench.methods.shared.avatar_files import TRACKED, Subject
 from headbench.methods.shared.optimisation import Optimiser
 from headbench.methods.shared.rendering import view_of
 from headbench.methods.shared.schedule import Timeline
-from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.shared.surface_points import SubjectMesh
 
 from ..shared.test_avatar_files import tracking
 

@@ -1,23 +1,200 @@
 """What one iteration adds up and changes, how many splats a run starts with, and avatars driven to extremes."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from skimage.metrics import structural_similarity
 
 from headbench.bench.contracts import Budget, no_progress
-from headbench.methods.gbs.blendshapes import PointMotions, apply_pose, difference_widths
-from headbench.methods.gbs.config import BlendshapeTraining, GBSConfig
-from headbench.methods.gbs.method import GBS
-from headbench.methods.gbs.mouth import mouth_cylinder, padded_offset, with_mouth
-from headbench.methods.gbs.training import DIFFERENCES, GBSTraining, sample_count
-from headbench.methods.shared.avatar_files import Subject
+from headbench.bench.errors import InputError
+from headbench.methods.gbs.blendshapes import (
+    EXPRESSIONS,
+    MEMBERS,
+    Entries,
+    PointMotions,
+    apply_pose,
+    difference_widths,
+    stored_of,
+    write_avatar,
+)
+from headbench.methods.gbs.method import (
+    DIFFERENCES,
+    GBS,
+    GBSTraining,
+    MouthCylinder,
+    mouth_cylinder,
+    padded_offset,
+    rows_of_teeth,
+    sample_count,
+    with_mouth,
+)
+from headbench.methods.gbs.spec import BlendshapeTraining, GBSConfig
+from headbench.methods.shared.avatar_files import AVATAR_FILE, Subject
 from headbench.methods.shared.schedule import Timeline
+from headbench.methods.shared.surface_points import SurfacePoints, full_barycentric
+from headbench.methods.shared.tensor_files import read_safetensors
 from headbench.methods.splats import rasterize
 
 from ..toy_clip import check_frame, look_at
+
+FACES, EXPRESSION_SIZE = 40, 60
+PUBLISHED_BYTES = 4 * 3128  # what the authors' viewer reads for each splat
+
+
+def write(path, count=30, expressions=50, degree=3, difference_degree=3, share=0.4):
+    """A random avatar; returns what was written."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    rest = (degree + 1) ** 2 - 1
+    widths = {
+        "means": (3,),
+        "log_scales": (3,),
+        "quats": (4,),
+        "opacities": (),
+        "sh_dc": (3,),
+        "sh_rest": (3, rest),
+    }
+    neutral = {name: normal(count, *shape) for name, shape in widths.items()}
+    moved_by = torch.rand(count, expressions, generator=generator) < share
+    owners, moving = moved_by.nonzero().unbind(1)
+    entries = Entries.of(moved_by.sum(1), moving, torch.ones(len(owners)))
+    differences = normal(len(owners), sum(difference_widths(difference_degree).values()))
+    rng = np.random.default_rng(0)
+    inside = rng.dirichlet(np.ones(3), count)[:, 1:].astype(np.float32)
+    points = SurfacePoints(rng.integers(0, FACES, count), full_barycentric(inside))
+    write_avatar(path, neutral, points, expressions, entries, differences)
+    return neutral, points, entries, differences
+
+
+def read(path):
+    head = SimpleNamespace(faces=range(FACES), expression_basis=np.zeros((1, 3, EXPRESSION_SIZE)))
+    return stored_of(path, *read_safetensors(path), head, "cpu")
+
+
+@pytest.mark.parametrize(("degree", "difference_degree"), [(3, 3), (3, 0), (2, 1), (0, 0)])
+def test_everything_comes_back_to_the_bit(tmp_path, degree, difference_degree):
+    path = tmp_path / AVATAR_FILE
+    degrees = {"degree": degree, "difference_degree": difference_degree}
+    neutral, points, entries, differences = write(path, expressions=37, **degrees)
+    found = read(path)
+    assert found.expressions == 37
+    assert set(found.neutral) == set(neutral)
+    for name, value in neutral.items():
+        assert torch.equal(found.neutral[name], value), name
+    assert torch.equal(found.differences, differences)
+    for one, other in zip(found.entries, entries):
+        assert torch.equal(one, other)
+    np.testing.assert_array_equal(found.points.triangles, points.triangles)
+    np.testing.assert_array_equal(found.points.barycentric, points.barycentric)
+
+
+@pytest.mark.parametrize(("share", "moving"), [(1.1, 50), (-1.0, 0)], ids=["all expressions", "none"])
+def test_bytes_of_a_splat_are_fewer_than_published(tmp_path, share, moving):
+    sizes = []
+    for count in (100, 300):
+        write(tmp_path / "x", count, share=share)
+        sizes.append((tmp_path / "x").stat().st_size)
+    per_splat = (sizes[1] - sizes[0]) / 200
+    assert per_splat == pytest.approx(4 * 59 + 12 + 7 + moving * 4 * 59, abs=0.2)
+    assert per_splat < PUBLISHED_BYTES
+
+
+def cut(name):
+    return lambda tensors: tensors.update({name: tensors[name][:-1].contiguous()})
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        *((cut(name), "x") for name in MEMBERS),
+        *((lambda t, name=name: t.pop(name), name) for name in MEMBERS),
+        (lambda t: t["splats"].__setitem__((0, 0), float("nan")), "splats"),
+        (lambda t: t["differences"].__setitem__((0, 0), float("inf")), "differences"),
+        (lambda t: t["triangles"].__setitem__(0, FACES), "triangles"),
+        (lambda t: t["triangles"].__setitem__(0, -1), "triangles"),
+        (lambda t: t.update(triangles=t["triangles"].float()), "triangles"),
+        (lambda t: t.update(splats=t["splats"].double()), "splats"),
+        (lambda t: t.update(splats=t["splats"][:, :-1].contiguous()), "splats"),
+        (lambda t: t.update(differences=t["differences"][:, :-1].contiguous()), "differences"),
+        (lambda t: t["moved_by"].__setitem__((0, 0), 255 - t["moved_by"][0, 0]), "differences"),
+        *((said, "expressions|moved_by") for said in ("", "-3", "fifty", "61", "20")),
+    ],
+)
+def test_tensors_and_texts_that_cannot_be_are_refused(tmp_path, change, says):
+    path = tmp_path / "x"
+    write(path)
+    tensors = load_file(path)
+    if callable(change):
+        change(tensors)
+    save_file(tensors, path, {EXPRESSIONS: "50" if callable(change) else change})
+    with pytest.raises(InputError, match=says):
+        read(path)
+
+
+def test_distances_to_the_cylinder_are_those_of_its_sides():
+    cylinder = MouthCylinder(torch.tensor([0.0, 1.0, 0.0]), 2.0, 3.0)
+    inside = torch.tensor([[1.0, 0.5, -1.0], [0, 1, 0]])
+    assert cylinder.violation(inside) == 0
+    sideways = torch.tensor([[3.0, 1.0, 4.0]])  # 5 from the axis
+    assert cylinder.violation(sideways) == pytest.approx(9.0)
+    upwards = torch.tensor([[0.0, 6.0, 0.0]])
+    assert cylinder.violation(upwards) == pytest.approx(4.0)
+    both = torch.cat([sideways + torch.tensor([0, 5.0, 0]), inside])
+    assert cylinder.violation(both) == pytest.approx((9 + 4) / 3)
+    on_axis = torch.zeros(1, 3, requires_grad=True)
+    cylinder.violation(on_axis).backward()
+    assert torch.isfinite(on_axis.grad).all()
+
+
+def test_teeth_at_rest_fit_their_cylinder(head):
+    mouth = with_mouth(head, GBSConfig())
+    teeth = torch.from_numpy(mouth.template[mouth.regions["teeth"]]).float()
+    cylinder = mouth_cylinder(teeth.numpy())
+    assert cylinder.violation(teeth) == 0
+    assert cylinder.violation(teeth + torch.tensor([0, 0, cylinder.radius])) > 0
+    assert cylinder.violation(teeth + torch.tensor([0, 2 * cylinder.half_height, 0])) > 0
+
+
+def test_teeth_hang_on_neck_and_jaw_and_know_no_expression(head):
+    mouth = with_mouth(head, GBSConfig())
+    upper, lower = rows_of_teeth(mouth)
+    assert len(upper) == len(lower) > 0
+    for row, joint in ((upper, 1), (lower, 2)):
+        corners = np.unique(mouth.faces[row])
+        assert (mouth.skinning_weights[corners, joint] == 1).all()
+        assert not mouth.expression_basis[corners].any()
+    again = with_mouth(mouth, GBSConfig())
+    assert len(again.template) == len(mouth.template)
+    offset = padded_offset(np.ones_like(head.template), len(mouth.template))
+    assert (offset[: len(head.template)] == 1).all()
+    assert not offset[len(head.template) :].any()
+
+
+def test_a_head_without_lips_stays_without_teeth(head, caplog):
+    bald = replace(head, regions={}, landmarks={})
+    mouth = with_mouth(bald, GBSConfig(lower_teeth_variant="official"))
+    assert rows_of_teeth(mouth) == []
+    assert len(mouth.template) == len(head.template)
+    assert "no teeth" in caplog.text
+
+
+def test_the_official_variants_of_the_mouth(head):
+    official = GBSConfig(correctives_variant="official", lower_teeth_variant="official")
+    plain, odd = with_mouth(head, GBSConfig()), with_mouth(head, official)
+    lower = odd.regions["teeth_lower"]
+    np.testing.assert_allclose(odd.skinning_weights[lower[0]], [0.0131, 0.0426, 0.9443, 0, 0])
+    np.testing.assert_allclose(odd.skinning_weights.sum(1), 1, atol=1e-3)
+    others = np.setdiff1d(np.arange(len(odd.template)), lower)
+    np.testing.assert_array_equal(odd.skinning_weights[others], plain.skinning_weights[others])
+    np.testing.assert_allclose(odd.pose_basis, 3 * plain.pose_basis)
+
 
 SMALL = GBSConfig(
     splats=BlendshapeTraining(densify_gradient=1e9, initial_opacity=0.5),

@@ -1,6 +1,6 @@
 """GHA made so small that tests train it in a second."""
 
-from headbench.methods.gha.config import GHAConfig
+from headbench.methods.gha.spec import GHAConfig
 
 SMALL = {
     "start": "mesh",

@@ -13,9 +13,8 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.engine.stored import TRAINING_FILE
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
-from headbench.methods.gha.avatar import DRIVING_FILE, GHAAvatar
 from headbench.methods.gha.gaussian_head import feature_camera
-from headbench.methods.gha.method import GHA, parted, within
+from headbench.methods.gha.method import DRIVING_FILE, GHA, GHAAvatar, parted, within
 from headbench.methods.shared.avatar_files import AVATAR_FILE
 
 from ..toy_clip import check_frame, first_view, look_at

@@ -5,12 +5,11 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.field import Architecture, Prior, RadianceField
-from headbench.methods.insta.marching import CanonicalSurface, canonical_surface
+from headbench.methods.insta.marching import CanonicalSurface, canonical_surface, mouth_triangles
 from headbench.methods.insta.occupancy import Occupancy
-from headbench.methods.insta.warp import mouth_triangles
-from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.insta.spec import InstaConfig
+from headbench.methods.shared.surface_points import SubjectMesh
 from headbench.methods.shared.threads import torch_threads
 
 SMALL = {

@@ -6,7 +6,6 @@ import torch
 
 from headbench.methods.insta import field as networks
 from headbench.methods.insta import kernel
-from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.field import (
     Architecture,
     Prior,
@@ -17,7 +16,8 @@ from headbench.methods.insta.field import (
     network,
     table_rows,
 )
-from headbench.methods.insta.rendering import Marching, PosedRays, camera_rays, render_rays
+from headbench.methods.insta.occupancy import Marching, PosedRays, camera_rays, render_rays
+from headbench.methods.insta.spec import InstaConfig
 
 from ..toy_clip import look_at
 from .small import by_threads, make_stage

@@ -10,7 +10,7 @@ from headbench.methods.insta import kernel
 from headbench.methods.insta.avatar import Inference
 from headbench.methods.insta.field import RadianceField
 from headbench.methods.insta.marching import Space
-from headbench.methods.insta.rendering import Marching, PosedRays, camera_rays
+from headbench.methods.insta.occupancy import Marching, PosedRays, camera_rays
 
 from ..toy_clip import look_at
 from .small import by_threads, make_stage

@@ -14,8 +14,7 @@ from headbench.methods.official.flashavatar.method import FlashAvatarOfficial
 from headbench.methods.official.ga.method import GAOfficial
 from headbench.methods.official.gbs.method import GBSOfficial
 from headbench.methods.official.gha.method import GHAOfficial
-from headbench.methods.official.insta.export import MASKS
-from headbench.methods.official.insta.method import INSTAOfficial
+from headbench.methods.official.insta.method import MASKS, INSTAOfficial
 from headbench.methods.official.rgbavatar.method import RGBAvatarOfficial
 from headbench.methods.official.tga.method import TGAOfficial
 

@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.methods.official.shim.blended import (
-    BatchRasterizer,
-    Settings,
-    TargetRasterizer,
-    rasterize_chart,
-)
+from headbench.methods.official.shim.cpu import BatchRasterizer, Settings, TargetRasterizer, rasterize_chart
 from headbench.methods.shared.surface_points import chart_resolution, texel_points
 from headbench.methods.splats import rasterize
 

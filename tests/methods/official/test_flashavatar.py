@@ -10,10 +10,12 @@ import torch
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_pixels
 from headbench.datasets.head.subject import pose_in_head_frame
-from headbench.methods.flashavatar.config import FlashAvatarConfig
 from headbench.methods.flashavatar.method import FlashAvatarTraining
 from headbench.methods.flashavatar.model import layer_of_points, network_outputs
-from headbench.methods.official.flashavatar.export import (
+from headbench.methods.flashavatar.spec import FlashAvatarConfig
+from headbench.methods.official.flashavatar.method import (
+    SHRINK,
+    SPLATS,
     ParsingMasks,
     chart_of_points,
     flame_subject,
@@ -22,11 +24,9 @@ from headbench.methods.official.flashavatar.export import (
     native_network,
     native_points,
 )
-from headbench.methods.official.flashavatar.method import SHRINK, SPLATS
-from headbench.methods.official.ga.windows import inside
-from headbench.methods.official.shim.meshes import Mesh, load_obj, rasterize_meshes
-from headbench.methods.official.surface import VisibleMesh
-from headbench.methods.official.video import training_frames
+from headbench.methods.official.ga.head_files import inside
+from headbench.methods.official.shim.blendshapes import Mesh, load_obj, rasterize_meshes
+from headbench.methods.official.video import VisibleMesh, training_frames
 from headbench.methods.shared.avatar_files import Subject
 
 from .helpers import check_tracked, read_tracked

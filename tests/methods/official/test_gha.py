@@ -10,8 +10,8 @@ import pytest
 from headbench.bench.contracts import Budget, Camera
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png
-from headbench.methods.official.ga.windows import square, square_side
-from headbench.methods.official.gha.export import MOUTH_ROWS, GHATracking, overshot
+from headbench.methods.official.ga.head_files import square, square_side
+from headbench.methods.official.gha.method import MOUTH_ROWS, GHATracking, overshot
 from headbench.methods.official.method import TRAINING_LOG
 from headbench.methods.shared.avatar_files import Subject
 

@@ -6,7 +6,7 @@ import numpy as np
 from headbench.bench.io.documents import read_json
 from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
 from headbench.datasets.monocular.insta import read_vertices
-from headbench.methods.official.insta.export import HAIR, MOUTH, SKIN
+from headbench.methods.official.insta.method import HAIR, MOUTH, SKIN
 
 from .helpers import pixels_of
 

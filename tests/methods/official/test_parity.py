@@ -13,11 +13,10 @@ from headbench.bench.engine import run as runner
 from headbench.bench.engine.config import resolve_cells
 from headbench.bench.io.documents import read_json
 from headbench.bench.rows import Row, Rows
-from headbench.methods.flashavatar.config import FlashAvatarConfig
-from headbench.methods.gbs.config import GBSConfig
-from headbench.methods.official.parity.parity import as_theirs, differences_of, run_config
-from headbench.methods.official.parity.settings import ParitySettings
-from headbench.methods.rgbavatar.config import RGBAvatarConfig
+from headbench.methods.flashavatar.spec import FlashAvatarConfig
+from headbench.methods.gbs.spec import GBSConfig
+from headbench.methods.official.parity.parity import ParitySettings, as_theirs, differences_of, run_config
+from headbench.methods.rgbavatar.spec import RGBAvatarConfig
 from headbench.methods.shared.config import PAPER_ITERATIONS, SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, Timeline
 

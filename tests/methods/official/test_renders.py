@@ -6,7 +6,7 @@ import pytest
 
 from headbench.bench.contracts import FrameKey
 from headbench.bench.errors import InputError
-from headbench.methods.official.renders import gaussian_blendshapes, insta
+from headbench.methods.official.workplace import gaussian_blendshapes, insta
 
 
 def test_gaussianblendshapes_numbers_the_last_350_frames(tmp_path):

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import yaml
 
-from headbench.methods.rgbavatar.config import RGBAvatarConfig
 from headbench.methods.rgbavatar.method import RGBAvatarTraining
+from headbench.methods.rgbavatar.spec import RGBAvatarConfig
 
 from .helpers import BUDGET, check_tracked, read_tracked
 from .repository import CONFIG

@@ -10,14 +10,16 @@ import pytest
 import torch
 
 from headbench.datasets.head.rotations import axis_angle_to_matrix
-from headbench.methods.insta.warp import squared_distances
+from headbench.methods.insta.marching import squared_distances
 from headbench.methods.official.method import LAUNCHER
 from headbench.methods.official.shim import blendshapes as shim
-from headbench.methods.official.shim import meshes
-from headbench.methods.official.shim.cpu import mean_square_distances
-from headbench.methods.official.shim.meshes import SMALLEST_AREA, Mesh, load_obj, rasterize_meshes
-from headbench.methods.official.shim.rasterizer import GaussianRasterizationSettings, GaussianRasterizer
-from headbench.methods.ops.harmonics import harmonic_colors, sh_basis
+from headbench.methods.official.shim.blendshapes import SMALLEST_AREA, Mesh, load_obj, rasterize_meshes
+from headbench.methods.official.shim.cpu import (
+    GaussianRasterizationSettings,
+    GaussianRasterizer,
+    mean_square_distances,
+)
+from headbench.methods.ops.planes import harmonic_colors, sh_basis
 from headbench.methods.shared.surface_points import texel_points
 from headbench.methods.splats import rasterize
 
@@ -131,10 +133,10 @@ def test_ids_around_a_point_and_their_shares():
 
 def test_six_numbers_are_the_first_rows_of_a_rotation():
     rotations = axis_angle_to_matrix(draw(4, 3))
-    six = meshes.matrix_to_rotation_6d(rotations)
+    six = shim.matrix_to_rotation_6d(rotations)
     assert torch.allclose(six[:, 3:], rotations[:, 1])
     stretched = torch.cat([2 * six[:, :3], six[:, 3:] + 0.3 * six[:, :3]], dim=1)
-    assert torch.allclose(meshes.rotation_6d_to_matrix(stretched), rotations)
+    assert torch.allclose(shim.rotation_6d_to_matrix(stretched), rotations)
 
 
 def test_meshes_are_sampled():

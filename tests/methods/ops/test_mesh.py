@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.head.rotations import matrix_to_quaternion
-from headbench.methods.ops.mesh import chart_axes, triangle_frames
-from headbench.methods.ops.splats import to_world
+from headbench.methods.ops.splats import chart_axes, to_world, triangle_frames
 
 
 def random_mesh(seed, faces=7):

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_flatten, tree_map
 
 from headbench.bench.native.dispatch import Operation
-from headbench.methods.ops import harmonics, kernel, mesh, photometric, planes, splats
+from headbench.methods.ops import kernel, photometric, planes, splats
 from headbench.methods.ops.photometric import mean_ssim
 from headbench.methods.shared.threads import torch_threads
 from headbench.methods.splats.cpu import instruction_sets
@@ -88,9 +88,9 @@ def rotations(normal: Callable[..., Tensor], count: int) -> Tensor:
     return torch.linalg.qr(normal(count, 3, 3)).Q
 
 
-def frames(normal: Callable[..., Tensor]) -> mesh.TriangleFrames:
-    return mesh.TriangleFrames(
-        *(value.clone() for value in mesh.triangle_frames(normal(VERTICES, 3), faces_of(FACES)))
+def frames(normal: Callable[..., Tensor]) -> splats.TriangleFrames:
+    return splats.TriangleFrames(
+        *(value.clone() for value in splats.triangle_frames(normal(VERTICES, 3), faces_of(FACES)))
     )
 
 
@@ -173,10 +173,10 @@ NETWORKS = {
 
 CASES = {
     "triangle frames": Case(
-        mesh.triangle_frames, lambda normal, count: (normal(VERTICES, 3), faces_of(count)), (0,)
+        splats.triangle_frames, lambda normal, count: (normal(VERTICES, 3), faces_of(count)), (0,)
     ),
     "turns between meshes": Case(
-        mesh.turns_between,
+        splats.turns_between,
         lambda normal, count: (rotations(normal, count), rotations(normal, count)),
         (0, 1),
     ),
@@ -224,7 +224,7 @@ CASES = {
     ),
     **{
         f"harmonics of degree {degree}": Case(
-            harmonics.harmonic_colors,
+            planes.harmonic_colors,
             lambda normal, count, degree=degree: (
                 normal(count, 3),
                 normal(count, 3, 15),
@@ -237,7 +237,7 @@ CASES = {
     },
     **{
         f"harmonic shader of degree {degree}, {'turned' if turned else 'in the world'}": Case(
-            harmonics.harmonic_shader,
+            planes.harmonic_shader,
             lambda normal, count, degree=degree, turned=turned: (
                 *(
                     normal(count, 3),
@@ -254,7 +254,7 @@ CASES = {
         for turned in (False, True)
     },
     "harmonics without coefficients to spare": Case(
-        harmonics.harmonic_colors,
+        planes.harmonic_colors,
         lambda normal, count: (normal(count, 3), normal(count, 3, 3), normal(count, 3), 1),
         (0, 1, 2),
     ),
@@ -383,7 +383,7 @@ def test_bits_do_not_depend_on_the_number_of_threads(name: str) -> None:
 
 
 def test_every_operation_is_compared() -> None:
-    modules = (harmonics, mesh, photometric, planes, splats)
+    modules = (photometric, planes, splats)
     found = {value for module in modules for value in vars(module).values() if isinstance(value, Operation)}
     assert found == {case.operation for case in CASES.values()}
 
@@ -391,7 +391,7 @@ def test_every_operation_is_compared() -> None:
 def test_the_definition_runs_where_the_kernel_takes_no_tensor() -> None:
     vertices, faces = numbers(0)(VERTICES, 3).double(), faces_of(FACES)
     found, expected = (
-        form(vertices, faces) for form in (mesh.triangle_frames, mesh.triangle_frames.definition)
+        form(vertices, faces) for form in (splats.triangle_frames, splats.triangle_frames.definition)
     )
     assert all(torch.equal(one, other) for one, other in zip(found, expected))
 
@@ -402,8 +402,8 @@ def test_a_triangle_without_area_has_a_finite_frame(backend: str) -> None:
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     faces = torch.tensor([[0, 1, 2], [0, 0, 0]])
     with kernel.backend(backend):
-        found = mesh.triangle_frames(vertices, faces)
-    for one, other in zip(found, mesh.triangle_frames.definition(vertices, faces)):
+        found = splats.triangle_frames(vertices, faces)
+    for one, other in zip(found, splats.triangle_frames.definition(vertices, faces)):
         assert torch.isfinite(one).all()
         torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
 
@@ -411,11 +411,11 @@ def test_a_triangle_without_area_has_a_finite_frame(backend: str) -> None:
 @needs_kernel
 def test_degenerate_splats_and_triangles_have_finite_gradients() -> None:
     vertices = torch.zeros(3, 3)
-    of_triangles = mesh.triangle_frames(vertices.requires_grad_(), torch.tensor([[0, 1, 2], [0, 0, 1]]))
+    of_triangles = splats.triangle_frames(vertices.requires_grad_(), torch.tensor([[0, 1, 2], [0, 0, 1]]))
     local = [torch.zeros(4, 3, requires_grad=True), torch.full((4, 3), -200.0, requires_grad=True)]
     quats = torch.zeros(4, 4, requires_grad=True)
     world = splats.to_world(of_triangles, torch.tensor([0, 1, 1, 0]), *local, quats)
-    colors = harmonics.harmonic_colors(torch.ones(4, 3), torch.ones(4, 3, 15), world.means, 3)
+    colors = planes.harmonic_colors(torch.ones(4, 3), torch.ones(4, 3, 15), world.means, 3)
     sum(value.sum() for value in (*world, colors)).backward()
     for leaf in (vertices, *local, quats):
         assert leaf.grad is not None

@@ -16,18 +16,18 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.engine.scoring import TrainingView
 from headbench.bench.engine.stored import TRAINING_FILE
 from headbench.datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions, jaw_weights
-from headbench.methods.ours.capacity import (
+from headbench.methods.ours.method import (
+    Ours,
     jaw_lever,
     largest_displacements,
     plan_capacity,
     spanning_jaw_bases,
 )
-from headbench.methods.ours.config import Lines, OursConfig, Penalty, PlannedCapacity
-from headbench.methods.ours.method import Ours
+from headbench.methods.ours.spec import Lines, OursConfig, Penalty, PlannedCapacity
 from headbench.methods.shared.avatar_files import clip_mesh
 from headbench.methods.shared.capacity import displacement_without, leading_directions, pixel_footprint
 from headbench.methods.shared.config import SplatTraining
-from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.shared.surface_points import SubjectMesh
 
 from ..toy_clip import toy_clip, toy_pose
 from .toy import changed

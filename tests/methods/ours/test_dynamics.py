@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from headbench.bench.errors import InputError
-from headbench.methods.ours.avatar import OursAvatar
 from headbench.methods.ours.field import LocalSplats, apply_offsets, changed_colors, offset_width
+from headbench.methods.ours.method import OursAvatar
 
 from .toy import REPAIRED, SMALL, changed, make, place, write
 

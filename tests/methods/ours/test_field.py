@@ -8,11 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.datasets.head.model import HeadModel
-from headbench.methods.ops.mesh import triangle_frames
-from headbench.methods.ops.splats import directions_to
+from headbench.methods.ops.splats import directions_to, triangle_frames
 from headbench.methods.ours.appearance import OursAppearance
-from headbench.methods.ours.config import Lines, OursConfig, Planes
 from headbench.methods.ours.field import (
+    RESIDUAL,
     CanonicalFrames,
     blend_lines,
     initial_line_network,
@@ -22,12 +21,12 @@ from headbench.methods.ours.field import (
     plane_box,
 )
 from headbench.methods.ours.method import Ours
-from headbench.methods.ours.storage import RESIDUAL
+from headbench.methods.ours.spec import Lines, OursConfig, Planes
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.optimisation import Optimiser
 from headbench.methods.shared.rendering import view_of
 from headbench.methods.shared.schedule import Timeline
-from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.shared.surface_points import SubjectMesh
 
 from .toy import changed
 

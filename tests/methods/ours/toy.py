@@ -6,13 +6,13 @@ import torch
 from torch import nn
 
 from headbench.methods.ours.appearance import OursAppearance
-from headbench.methods.ours.config import Lines, OursConfig, Planes
-from headbench.methods.ours.storage import FIELD_FILE, write_field
+from headbench.methods.ours.field import FIELD_FILE, write_field
+from headbench.methods.ours.spec import Lines, OursConfig, Planes
 from headbench.methods.shared.avatar_files import SUBJECT_FILE, Subject, save_shared_head, write_subject
 from headbench.methods.shared.optimisation import Optimiser
 from headbench.methods.shared.rendering import view_of
 from headbench.methods.shared.schedule import Timeline
-from headbench.methods.shared.subject_mesh import SubjectMesh
+from headbench.methods.shared.surface_points import SubjectMesh
 
 from ..recorded import recorded
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from headbench.methods.rgbavatar.config import RGBAvatarConfig
 from headbench.methods.rgbavatar.method import GLOBAL, LOCAL, OnlineBatches, RGBAvatarTraining
+from headbench.methods.rgbavatar.spec import RGBAvatarConfig
 from headbench.methods.shared.schedule import Timeline
 
 from .small import SMALL

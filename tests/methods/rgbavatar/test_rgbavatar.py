@@ -11,16 +11,15 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.methods.avatars.compact.codecs import parts_of, write_coded
-from headbench.methods.avatars.compact.precision import EXACT
-from headbench.methods.ops.harmonics import C0
-from headbench.methods.rgbavatar.config import INPUTS, RGBAvatarConfig
+from headbench.methods.avatars.settings import EXACT
+from headbench.methods.ops.planes import C0
 from headbench.methods.rgbavatar.method import RGBAvatar, RGBAvatarTraining
 from headbench.methods.rgbavatar.model import SHAPES, StoredShapes, blend_weights, blended, seen_colors
+from headbench.methods.rgbavatar.spec import INPUTS, RGBAvatarConfig
 from headbench.methods.shared.avatar_files import AVATAR_FILE
-from headbench.methods.shared.networks import initial_network, input_count, tracked_inputs
+from headbench.methods.shared.optimisation import initial_network, input_count, tracked_inputs
 from headbench.methods.shared.schedule import Timeline
-from headbench.methods.shared.subject_mesh import SubjectMesh
-from headbench.methods.shared.surface_points import point_tensors, poisson_disk
+from headbench.methods.shared.surface_points import SubjectMesh, point_tensors, poisson_disk
 from headbench.methods.shared.tensor_files import read_safetensors, write_tensors
 from headbench.methods.splats import pixel_weights, rasterize
 

@@ -7,8 +7,8 @@ import pytest
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.methods.ga.config import GAConfig
 from headbench.methods.ga.method import GA
+from headbench.methods.ga.spec import GAConfig
 from headbench.methods.shared.avatar_files import TRACKED, RefinedTracking, read_shared_head, save_shared_head
 from headbench.methods.shared.config import SplatTraining
 

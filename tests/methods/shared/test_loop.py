@@ -10,8 +10,7 @@ from headbench.methods.ga.method import GA
 from headbench.methods.shared import loop
 from headbench.methods.shared import method as shared
 from headbench.methods.shared.loop import CHECKPOINT, Fit, train
-from headbench.methods.shared.losses import position_penalty, scale_penalty
-from headbench.methods.shared.optimisation import Optimiser
+from headbench.methods.shared.optimisation import Optimiser, position_penalty, scale_penalty
 from headbench.methods.shared.threads import threads, torch_threads
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from headbench.methods.shared.needs import splats
+from headbench.methods.shared.method import splats
 from headbench.methods.splats import cuda
 
 

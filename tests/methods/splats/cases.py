@@ -7,12 +7,7 @@ from typing import NamedTuple
 import pytest
 import torch
 
-from headbench.methods.benchmarks.scenes import (
-    DrawnScene,
-    SplatScene,
-    relative_error,
-    render_with_gradients,
-)
+from headbench.methods.benchmarks.splats import DrawnScene, SplatScene, relative_error, render_with_gradients
 from headbench.methods.splats import available_backends
 from headbench.methods.splats.request import Request, make_request
 

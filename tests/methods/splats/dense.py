@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from headbench.methods.benchmarks.scenes import SplatScene
+from headbench.methods.benchmarks.splats import SplatScene
 
 
 class Dense(NamedTuple):

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from headbench.bench.errors import UnavailableError
-from headbench.methods.benchmarks.scenes import cloud, head_shell, relative_error
+from headbench.methods.benchmarks.splats import cloud, head_shell, relative_error
 from headbench.methods.splats import available_backends, cpu, cuda, rasterize
 
 from .cases import request_of

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from headbench.methods.benchmarks.scenes import (
+from headbench.methods.benchmarks.splats import (
     DIFFERENTIABLE,
     SplatScene,
     cloud,

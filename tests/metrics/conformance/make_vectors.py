@@ -35,10 +35,7 @@ def skimage_scores(pair):
 
 
 def torchmetrics_scores(pair):
-    from torchmetrics.functional.image import (
-        peak_signal_noise_ratio,
-        structural_similarity_index_measure,
-    )
+    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
     x, y = tensors(pair)
     return {

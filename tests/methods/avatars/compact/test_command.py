@@ -8,8 +8,8 @@ import pytest
 
 from headbench.bench.engine.stored import avatar_folder, load_avatar
 from headbench.bench.errors import InputError
-from headbench.methods.avatars.compact.measure import compact_avatar
-from headbench.methods.avatars.compact.settings import CompactSettings
+from headbench.methods.avatars.compact.codecs import compact_avatar
+from headbench.methods.avatars.settings import CompactSettings
 
 from ....world import finished
 

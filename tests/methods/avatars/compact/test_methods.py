@@ -8,22 +8,22 @@ from headbench.bench.errors import InputError
 from headbench.bench.registry import get, resolve
 from headbench.methods.avatars.compact import layouts
 from headbench.methods.avatars.compact.codecs import parts_of, write_coded
-from headbench.methods.avatars.compact.container import Content, read_content
-from headbench.methods.avatars.compact.precision import EXACT, Precision
+from headbench.methods.avatars.compact.coder import Content, read_content
 from headbench.methods.avatars.derived.recipes import STEPS, coded_name
-from headbench.methods.flashavatar.config import FlashAvatarConfig
+from headbench.methods.avatars.settings import EXACT, Precision
 from headbench.methods.flashavatar.method import FlashAvatar
-from headbench.methods.ga.config import GAConfig
+from headbench.methods.flashavatar.spec import FlashAvatarConfig
 from headbench.methods.ga.method import GA
-from headbench.methods.gbs.config import GBSConfig
+from headbench.methods.ga.spec import GAConfig
 from headbench.methods.gbs.method import GBS
-from headbench.methods.gha.config import GHAConfig
+from headbench.methods.gbs.spec import GBSConfig
 from headbench.methods.gha.method import GHA
-from headbench.methods.insta.config import InstaConfig
+from headbench.methods.gha.spec import GHAConfig
 from headbench.methods.insta.method import Insta
+from headbench.methods.insta.spec import InstaConfig
 from headbench.methods.ours.method import Ours
-from headbench.methods.rgbavatar.config import RGBAvatarConfig
 from headbench.methods.rgbavatar.method import RGBAvatar
+from headbench.methods.rgbavatar.spec import RGBAvatarConfig
 from headbench.methods.shared.avatar_files import COMPACT_FILE, read_shared_head
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.trivial.method import NearestCamera

@@ -3,10 +3,9 @@ from typing import NamedTuple
 import pytest
 
 from headbench.bench.contracts import no_progress
+from headbench.methods.avatars.settings import ExportHtmlSettings
 from headbench.methods.avatars.web import export
-from headbench.methods.avatars.web.bake import Source
-from headbench.methods.avatars.web.model import WebAvatar
-from headbench.methods.avatars.web.settings import ExportHtmlSettings
+from headbench.methods.avatars.web.bake import Source, WebAvatar
 
 from ....world import finished
 

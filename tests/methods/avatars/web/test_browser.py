@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from headbench.methods.avatars.views import direction_of, orbit_camera
+from headbench.methods.avatars.harmonics import direction_of, orbit_camera
 from headbench.methods.avatars.web.export import decode, draw, encode
 
 SIDE = 200

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.methods.benchmarks.scenes import SplatScene, cloud, head_shell, relative_error
+from headbench.methods.benchmarks.splats import SplatScene, cloud, head_shell, relative_error
 from headbench.methods.splats.rasterize import rasterize
 
 COMPILER, EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
