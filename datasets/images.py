@@ -10,10 +10,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..bench.contracts import ByteArray
+from ..bench.contracts import ByteArray, FloatArray
 from ..bench.errors import InputError
 from ..bench.io.files import write_bytes
 from ..bench.io.images import encode_image, probe_image, read_pixels
+
+
+def srgb_to_linear(values: FloatArray) -> FloatArray:
+    """Decode sRGB in [0, 1] (IEC 61966-2-1)."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
 
 _ROWS = 64
 

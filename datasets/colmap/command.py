@@ -58,7 +58,7 @@ def export_colmap(settings: ExportColmapSettings, progress: Progress) -> Command
     See `export_model`. Raises `InputError` for timesteps that the capture lacks.
     """
     from ..clip import check_apart
-    from .writer import export_model, export_tracking
+    from .reader import export_model, export_tracking
 
     clip = settings.open(settings.capture, progress)
     out = Path(settings.out)

@@ -37,8 +37,8 @@ from ...bench.specs import CommandResult, command
 from ..clip import CaptureClip, FrameFiles, without_images
 from ..ga.writer import CANONICAL_JAW, CapturePlan, CaptureWriter, SequencePlan
 from ..head.arrays import JOINT_NAMES, HeadArrays, read_head
+from ..head.model import PosedSubject, pose_in_head_frame, resting
 from ..head.refit.identity import FACE
-from ..head.subject import PosedSubject, pose_in_head_frame, resting
 from ..mesh_pictures import portrait_camera
 from ..video.decode import SUFFIXES
 from .formats import read_signal

@@ -29,10 +29,19 @@ from ...bench.registry import finds, readers, unknown
 from ..ga.layout import Declaration
 from ..ga.tracking import POSE_SIZES, find_head, read_animation, read_tracking
 from ..head.arrays import HeadArrays
-from .blendshapes import ARKIT, apply_blendshapes, is_blendshapes, read_blendshapes
-from .names import IDENTITY, NAMES
-from .signal import AVATAR, NO_EYELIDS, POSE_PARTS, DrivingSignal, SignalRequest, make_poses
-from .table import SignalTable, read_table
+from .signal import (
+    ARKIT,
+    AVATAR,
+    NO_EYELIDS,
+    POSE_PARTS,
+    DrivingSignal,
+    SignalRequest,
+    apply_blendshapes,
+    is_blendshapes,
+    make_poses,
+    read_blendshapes,
+)
+from .table import IDENTITY, NAMES, SignalTable, read_table
 from .timing import Timing, in_order
 
 TRACKED_HEAD = "flame2023"

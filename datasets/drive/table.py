@@ -21,9 +21,34 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy, read_npz
 from ...bench.io.documents import parse_json, read_text, shown
 from ...bench.io.files import reading, user_files
-from ..foreign import describe
-from .names import IDENTITY, NAMES
+from ..open import describe
 from .timing import Timing, from_columns, in_order, is_empty
+
+NAMES: Mapping[str, tuple[str, ...]] = {
+    "expression": ("expression", "expression_params", "exp", "expcode", "expr"),
+    "jaw": ("jaw", "jaw_pose", "jaw_params", "jawpose"),
+    "rotation": ("rotation", "pose_params", "torso_pose", "global_pose", "globalpose"),
+    "neck": ("neck", "neck_pose"),
+    "eyes": ("eyes", "eyes_pose", "eye_pose"),
+    "left_eye": ("eye_l_pose",),
+    "right_eye": ("eye_r_pose",),
+    "eyelids": ("eyelids", "eyelid_params"),
+    "translation": ("translation",),
+    "pose": ("pose", "posecode"),
+}
+"""Names of the arrays by part; ``pose`` is rotation, then jaw, of DECA and EMOCA. The first name that is found counts."""
+
+IDENTITY = (
+    "shape",
+    "shapecode",
+    "shape_params",
+    "shape_from_facenet",
+    "static_offset",
+    "dynamic_offset",
+    "betas",
+)
+"""Names of arrays of the subject, of any length."""
+
 
 _CATEGORY_NAMES, _SCORE = ("categoryName", "category_name"), "score"
 """Keys of MediaPipe's categories in its JavaScript, Java and C#, and in its Python."""

@@ -10,18 +10,20 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import savgol_filter
 
-from ...bench.contracts import FloatArray, FrameKey, HeadPose, Progress, no_progress
+from ...bench.contracts import FloatArray, FrameKey, HeadAsset, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.experiments.reenactment import AT_ORIGIN, RigidMean, retarget
 from ..clip import CaptureClip, FrameFiles, without_images
 from ..head.arrays import HeadArrays
+from ..head.model import PosedSubject, resting
 from ..head.refit.identity import match
 from ..head.refit.refit import BlockFitter, refit
 from ..head.refit.settings import RefitSettings
 from ..head.rotations import rotation_of
-from ..head.subject import PosedSubject, resting
 from ..head.teeth import with_teeth_where_possible
-from .signal import NO_EYELIDS, DrivingSignal
+from .formats import read_rows
+from .signal import NO_EYELIDS, DrivingSignal, SignalRequest
+from .table import SignalTable, parse_line
 from .timing import GAP, Timing
 
 SMOOTHED = ("expression", "jaw", "eyes", "eyelids", "neck", "rotation", "translation")
@@ -247,3 +249,47 @@ def _eyelids(pose: HeadPose, target: HeadArrays) -> FloatArray | None:
     if target.eyelid_basis is None:
         return None
     return np.zeros(target.eyelid_basis.shape[2]) if pose.eyelids is None else pose.eyelids
+
+
+class LiveDriver:
+    """Converts lines of one frame each (coefficients or blendshapes, as for `read_signal`) to poses of a head model.
+
+    Parameters
+    ----------
+    target : HeadAsset
+        Head model of the avatar.
+    signal_head : str
+        See `settings.DriveSettings`.
+    """
+
+    def __init__(self, target: HeadAsset, signal_head: str = ""):
+        if not isinstance(target, HeadArrays):
+            raise InputError(
+                "avatar", "head", "a head model of headbench's own arrays", type(target).__name__
+            )
+        self._target, self._signal_head = target, signal_head
+        if signal_head:
+            SignalRequest(
+                Path("live signal"), target, signal_head=signal_head
+            ).head()  # Raises for a file that cannot be read.
+        self._transfer: dict[str, FrameTransfer] = {}
+        self._first: RigidMean | None = None
+
+    def __call__(self, line: str) -> HeadPose:
+        """The pose of a line; the head moves around the origin, relative to the first line.
+
+        Raises `InputError` for a line that is not a frame of a known format.
+        """
+        path = Path("live signal")
+        frame = parse_line(line, path, "line")
+        if not frame:
+            raise InputError(path, "line", "values of a frame with a face", "none")
+        columns = {name: [value] for name, value in frame.items()}
+        table = SignalTable(path, columns, ["line"], Timing.regular(1))
+        signal = read_rows(SignalRequest(path, self._target, table, self._signal_head))
+        version = signal.head.version
+        if version not in self._transfer:
+            self._transfer[version] = FrameTransfer(signal.head, self._target)
+        pose = self._transfer[version](signal.poses[0])
+        self._first = self._first or RigidMean.of([pose])
+        return retarget(pose, self._first, AT_ORIGIN, pose.subject)

@@ -31,7 +31,7 @@ from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.documents import checked, read_json, shown
 from ...bench.io.files import check_name, json_text, with_slashes, write_json
-from ..rounding import ANGLE_BITS, on_grid
+from ..head.geometry import ANGLE_BITS, on_grid
 
 CyConvention = Literal["top", "bottom", "centre"]
 """Convention of the principal point: ``cy`` from the top edge, from the bottom edge, or the image centre instead of

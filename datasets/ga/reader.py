@@ -20,15 +20,13 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest
 from ...bench.io.images import ImageInfo
 from ..clip import CaptureClip, FrameFiles
-from ..foreign import MONOCULAR, describe
 from ..head.arrays import HeadArrays, in_memory
 from ..images import ImageStore
+from ..open import MONOCULAR, describe
 from ..steps.exclude import exclude_given, exclude_timesteps
 from ..steps.masks import check_colour, mask_below_neck, set_background
 from . import layout
-from .cameras import CaptureCameras, collect_cameras
-from .content_digests import digests_below
-from .principal_point import settle_cy
+from .cameras import CaptureCameras, collect_cameras, settle_cy
 from .tracking import TeethPolicy, Tracking, check_version, read_head_model, read_tracking
 from .transforms import RAISED, Faults, FrameEntry, read_transforms
 from .validate import (
@@ -37,6 +35,7 @@ from .validate import (
     check_images,
     check_leaks,
     check_timesteps,
+    digests_below,
     find_leaks,
     sequence_names,
     split_by_holding_out,

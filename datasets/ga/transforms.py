@@ -22,7 +22,7 @@ from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import check_name, with_slashes
-from ..foreign import IMAGES, frame_route
+from ..open import IMAGES, frame_route
 from .layout import TRACKING_FOLDER
 
 INTRINSIC_KEYS = ("cx", "cy", "fl_x", "fl_y", "camera_angle_x")

@@ -141,7 +141,7 @@ class HeadArrays:
         static_offset : FloatArray | None
             (V, 3) metres, added to the shaped template.
         """
-        from .subject import PosedSubject  # with torch
+        from .model import PosedSubject  # with torch
 
         shape = np.zeros(self.shape_basis.shape[2]) if shape is None else shape
         offset = np.zeros(self.template.shape) if static_offset is None else static_offset
@@ -149,7 +149,7 @@ class HeadArrays:
 
     def named_expressions(self) -> list[Expression]:
         """Named expressions of the model; none for models like FLAME."""
-        from .names import named_expressions  # imported here because few callers need it
+        from .procedural.versions import named_expressions  # imported here because few callers need it
 
         return named_expressions(self.version, self.expression_names, self.expression_basis.shape[2])
 

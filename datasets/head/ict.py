@@ -33,9 +33,18 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, Member, check_arrays, read_npz
 from ...bench.io.documents import read_json, read_text
 from ...bench.io.files import read_bytes, reading
-from ..rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .arrays import HeadArrays
-from .geometry import border_edges, even_weights, fit_sphere, mesh_edges, smoothstep
+from .geometry import (
+    LENGTH_BITS,
+    REGRESSOR_BITS,
+    SHARE_BITS,
+    border_edges,
+    even_weights,
+    fit_sphere,
+    mesh_edges,
+    on_grid,
+    smoothstep,
+)
 
 VERSION = "ict-facekit"
 LANDMARKS = tuple(f"ibug_{index:02d}" for index in range(68))

@@ -41,7 +41,7 @@ from ..ga.transforms import check_lenses, read_rigid
 from ..head.arrays import JOINT_NAMES, HeadArrays
 from ..head.loaders import EYELIDS_REMEDY
 from ..head.model import HeadModel
-from .track import VIDEO, Track, VideoFrame, coefficients, frame_number, ordered, rotations_of_6d
+from .clip import VIDEO, Track, VideoFrame, coefficients, frame_number, ordered, rotations_of_6d
 
 WORST_DISTANCE = 1e-4
 """Maximum median distance of vertices from the mesh, metres: rounding gives 1e-8, another head model of the same

@@ -30,9 +30,8 @@ from ..ga.tracking import TeethPolicy, find_head
 from ..ga.transforms import read_rigid
 from ..head.arrays import HeadArrays
 from ..steps.exclude import exclude_given, exclude_timesteps
-from .clip import WHITE, clip_of_track
+from .clip import WHITE, Track, VideoFrame, clip_of_track, coefficients, frame_number, ordered
 from .insta import is_insta, read_insta
-from .track import Track, VideoFrame, coefficients, frame_number, ordered
 
 PARAMETERS = "flame_params.json"
 SCALE = 4.0

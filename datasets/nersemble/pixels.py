@@ -26,7 +26,7 @@ from ...bench.contracts import ByteArray, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import check_numbers, read_npy
 from ...bench.io.images import read_bgr
-from ..srgb import srgb_to_linear
+from ..images import srgb_to_linear
 
 Correction = Callable[[ByteArray], ByteArray]
 """From (H, W, 3) 8-bit RGB to the same."""

@@ -21,12 +21,12 @@ from .names import (
     TEST_SEQUENCE,
     TONGUE_SEQUENCES,
     UNION10_SEQUENCES,
+    PrepareSettings,
     union10_held_out,
 )
 from .pixels import Correction
 from .recording import Participant, participant, read_calibration
 from .sequence import RecordedSequence, read_sequence
-from .settings import PrepareSettings
 from .tracking import TrackedSequence, find_tracked, read_tracked
 
 CY: layout.CyConvention = "bottom"

@@ -20,7 +20,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import digest, digest_file
 from ...bench.io.images import read_pixels
 from ..clip import CaptureClip, FramePixels
-from ..head.subject import PosedSubject
+from ..head.model import PosedSubject
 
 Ground = Sequence[float] | FloatArray
 """A colour (3,) in [0, 1], or an image (H, W, 3) of the empty set."""

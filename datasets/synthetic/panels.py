@@ -19,7 +19,7 @@ import numpy as np
 from ...bench.contracts import Camera, FloatArray, IntArray
 from ...bench.errors import InputError
 from ...bench.native.loader import Kernel
-from ..rounding import ANGLE_BITS, COEFFICIENT_BITS, LENGTH_BITS, on_grid
+from ..head.geometry import ANGLE_BITS, COEFFICIENT_BITS, LENGTH_BITS, on_grid
 from .plan import CAMERA_DISTANCE
 
 KERNEL = Kernel("headbench.datasets.synthetic._light", "The renderer of synthetic captures")

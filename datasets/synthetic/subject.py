@@ -11,20 +11,26 @@ from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ..head.arrays import HeadArrays, region
-from ..head.geometry import smoothstep, triangle_areas, unique_pairs, vertex_normals
+from ..head.geometry import LENGTH_BITS, on_grid, smoothstep, triangle_areas, unique_pairs, vertex_normals
 from ..head.model import HeadModel, joint_motions
 from ..head.rotations import axis_angle_to_matrix
-from ..rounding import LENGTH_BITS, on_grid
-from .anatomy import SIDES, Anatomy, Person, linear, measure
-from .fields import smooth_curve, value_noise
-from .hair import STYLES, RootedStrands, Strands, ear_share, make_beard, make_brows_and_lashes, make_hair
-from .history import SkinState
-from .lag import FREE_LENGTH, NECK_SHARE
+from .anatomy import SIDES, Anatomy, Person, linear, measure, smooth_curve, value_noise
+from .hair import (
+    STYLES,
+    RootedStrands,
+    Strands,
+    ear_share,
+    make_beard,
+    make_brows_and_lashes,
+    make_hair,
+    smoothed,
+    without_joints,
+)
+from .history import FREE_LENGTH, NECK_SHARE, SkinState
 from .parts import eye_mesh, tracked_parts
 from .performance import EXPRESSION_CONTROLS, Activations, Translation
 from .plan import Geometry
 from .skin import gloss_at_rest, make_folds, paint_skin, sagging
-from .volume import smoothed, without_joints
 
 _SIDES_OF_TUBE = 8
 _WRAP = 3.0  # 1/m: how the front bends around the face

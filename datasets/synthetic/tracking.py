@@ -23,8 +23,8 @@ from scipy.optimize import nnls
 from ...bench.contracts import FloatArray, HeadPose
 from ...bench.protocol import evenly_with_ends
 from ..head.arrays import HeadArrays, region
+from ..head.geometry import COEFFICIENT_BITS, on_grid, share_left
 from ..head.model import HeadModel
-from ..rounding import COEFFICIENT_BITS, on_grid, share_left
 from .anatomy import SIDES
 from .performance import EXPRESSION_CONTROLS, Activations, Translation
 

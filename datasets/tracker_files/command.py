@@ -73,7 +73,7 @@ class ImportTrackingSettings:
 
 if TYPE_CHECKING:
     from ..clip import CaptureClip
-    from .pictures import VideoPictures
+    from .frames import VideoPictures
 
 REPORT, PICTURE = "import.json", "overlay.png"
 SHOWN = 6
@@ -92,13 +92,11 @@ def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_pr
     from ..head.refit.command import target_head
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
+    from ..inspect.figure import draw_overlay
     from ..monocular.clip import clip_of_track, subject_of
-    from ..overlay import draw_overlay
     from ..steps.masks import without_torso
     from .formats import recognise
-    from .frames import FOLDER, frame_files, read_frames
-    from .pictures import find_pictures
-    from .video import left_out, video_track
+    from .frames import FOLDER, find_pictures, frame_files, left_out, read_frames, video_track
 
     root, out = Path(settings.source), Path(settings.out)
     if not settings.format:

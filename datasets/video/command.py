@@ -18,13 +18,11 @@ from ...bench.progress import counted
 from ...bench.tflite import fetched_network
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
-from ..tracking.embedding import Embedding
-from ..tracking.focal import FocalLength, estimate_focal
-from ..tracking.network import NetworkLandmarks, head_embedding
-from ..tracking.work import TRACKER_VERSION, make_work_folder
+from ..tracking.fit import FocalLength, estimate_focal
+from ..tracking.landmarks import Embedding, NetworkLandmarks, head_embedding
+from ..tracking.settings import TRACKER_VERSION, make_work_folder
 from .clip import USUAL_FOCAL, FrameView, VideoClip, open_video
-from .detector import FaceFinder
-from .faces import LEAST_SEEN, REMEDY
+from .faces import LEAST_SEEN, REMEDY, FaceFinder
 
 if TYPE_CHECKING:
     from ..tracking.settings import TrackSettings

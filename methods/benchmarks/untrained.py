@@ -10,7 +10,7 @@ import torch
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadAsset, HeadPose, StepRecord
 from ...datasets.head.procedural.model import procedural_head
-from ...datasets.steps.jaw_bases import jaw_quaternions
+from ...datasets.steps.clusters import jaw_quaternions
 from ..ga.method import GAAvatar
 from ..ours.avatar import OursAvatar
 from ..ours.config import OursConfig

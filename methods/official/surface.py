@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, HeadAsset, HeadPose, IntArray
-from ...datasets.head.subject import PosedSubject, pose_in_head_frame
+from ...datasets.head.model import PosedSubject, pose_in_head_frame
 from ..insta.marching import CanonicalSurface, PosedSurface
 from ..insta.rendering import camera_rays
 from ..shared.subject_mesh import pose_key

@@ -14,7 +14,7 @@ import torch
 
 from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import JOINT_NAMES, faces_in_region
-from ...datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions
+from ...datasets.steps.clusters import IDENTITY, farthest_quaternions, jaw_quaternions
 from ..ops.planes import Bounds
 from ..shared.capacity import CapacityPlan, CapacityPlanner
 from ..shared.evidence import JAW

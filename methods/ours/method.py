@@ -12,8 +12,7 @@ import numpy as np
 
 from ...bench.contracts import Clip
 from ...datasets.head.arrays import faces_in_region
-from ...datasets.steps.clusters import cluster_expressions
-from ...datasets.steps.jaw_bases import leaks
+from ...datasets.steps.clusters import cluster_expressions, leaks
 from ..shared.avatar_files import (
     SUBJECT_FILE,
     Subject,

@@ -17,7 +17,7 @@ from ...bench.contracts import BoolArray, ByteArray, Camera, FloatArray, Frame, 
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member, read_arrays
 from ...bench.protocol import evenly_with_ends
-from ...datasets.head.subject import PosedSubject
+from ...datasets.head.model import PosedSubject
 from ...datasets.mesh_pictures import rasterize_mesh
 from ..shared.avatar_files import (
     SUBJECT_FILE,

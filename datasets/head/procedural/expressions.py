@@ -16,9 +16,8 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
 from ....bench.contracts import FloatArray
-from ...rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
-from ..geometry import mesh_edges, smoothstep, unique_pairs
-from .anatomy import EYE_CENTER, EYE_RADIUS, MOUTH_HALF_WIDTH, eye_front, lid_curves, lip_arc
+from ..geometry import COEFFICIENT_BITS, LENGTH_BITS, mesh_edges, on_grid, smoothstep, unique_pairs
+from .sculpture import EYE_CENTER, EYE_RADIUS, MOUTH_HALF_WIDTH, eye_front, lid_curves, lip_arc
 from .surface import MIRROR, SculptedHead, jaw_weight
 
 _MIXING_BITS = 25  # 2**-25 times 2**-27 m: exact up to two metres in float64

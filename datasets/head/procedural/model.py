@@ -6,8 +6,8 @@ import functools
 
 import numpy as np
 
-from ...rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from ..arrays import HeadArrays
+from ..geometry import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .expressions import LIDS, identity_basis
 from .surface import (
     PARENTS,

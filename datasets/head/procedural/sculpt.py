@@ -16,8 +16,9 @@ from skimage.measure import marching_cubes
 from ....bench.contracts import FloatArray, IntArray
 from ....bench.io.files import atomic_path
 from ..geometry import border_edges, mesh_edges, triangle_areas, unique_pairs
-from .anatomy import (
+from .sculpture import (
     CLOSED_LIP_GAP,
+    EAR_ORIGIN,
     EYE_CENTER,
     FLOOR,
     LATERAL_CANTHUS,
@@ -30,9 +31,9 @@ from .anatomy import (
     eye_front,
     lid_curves,
     lip_arc,
+    sculpture,
     slit_height,
 )
-from .sculpture import EAR_ORIGIN, sculpture
 
 SHORTEST_EDGE = 0.00035  # metres; lids and lips are sculpted several times further apart
 ITERATIONS = 40  # of centring the clusters that become coarse vertices

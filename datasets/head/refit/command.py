@@ -34,8 +34,7 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     """
     from ...clip import check_apart
     from ...images import write_image
-    from .heat_map import draw_heat_map
-    from .refit import refit
+    from .refit import draw_heat_map, refit
     from .rewrite import capture_plan, write_capture
 
     out = Path(settings.out)

@@ -21,7 +21,7 @@ from ...head.arrays import HeadArrays, read_head
 from ...head.loaders import load_head
 from ...head.teeth import with_teeth_where_possible
 from ..recording import read_calibration
-from .tracks import MEMBERS, MONO, BenchmarkTrack, tracking_file
+from .submission import MEMBERS, MONO, BenchmarkTrack, tracking_file
 
 
 @dataclass(frozen=True)

@@ -74,9 +74,8 @@ def _look(
     clip: CaptureClip, settings: TongueSettings, earlier: Exclusions | None, sheet: Path, progress: Progress
 ) -> Exclusions:
     """Decide on one subject and draw its contact sheet."""
-    from .evidence import decide, find_evidence
+    from .evidence import decide, find_evidence, write_sheet
     from .mouth import facing_cameras, frames_by_timestep, mouth_atlas, sample_clip
-    from .review import write_sheet
 
     overrides = earlier.overrides if earlier else {}
     frames = frames_by_timestep(clip)

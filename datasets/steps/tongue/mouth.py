@@ -30,7 +30,7 @@ from ....bench.machine import processor_count
 from ....bench.protocol import evenly_with_ends
 from ...head.arrays import JOINT_NAMES, region
 from ...head.geometry import vertex_normals
-from ...head.subject import PosedSubject
+from ...head.model import PosedSubject
 from ...mesh_pictures import rasterize_mesh
 
 PITCH = 0.0015

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from headbench.datasets.srgb import srgb_to_linear
+from headbench.datasets.images import srgb_to_linear
 from headbench.methods.insta.config import InstaConfig
 from headbench.methods.insta.training import color_loss, depth_loss, target_colors, to_linear, to_srgb
 
