@@ -150,24 +150,7 @@ PixelStep = Callable[[FrameKey, FramePixels], FramePixels]
 
 @dataclass(frozen=True, eq=False)
 class CaptureClip:
-    """A `Clip` whose images are read from disk on request.
-
-    Attributes
-    ----------
-    files : Mapping[FrameKey, FrameFiles]
-        Files of every frame, including excluded frames. Pixel steps change these pixels for methods.
-    source_fingerprint : str
-        Digest of the content of all files of the clip, independent of their location.
-    store : ImageStore
-        Decodes images and bounds their memory; shared by clips derived from one another.
-    pixel_steps : tuple[PixelStep, ...]
-        Steps applied in order when a frame is read, with one rounding to 8 bits at the end.
-    read_background : FloatArray | None
-        Colour that straight-alpha files are composited on before the pixel steps; None means
-        `background`.
-    source : Clip | None
-        The clip that gives the pixels of frames without files, see `as_capture`.
-    """
+    """A `Clip` whose images are read from disk on request."""
 
     subject: str
     head: HeadArrays
@@ -180,11 +163,17 @@ class CaptureClip:
     background: FloatArray
     steps: Sequence[StepRecord]
     files: Mapping[FrameKey, FrameFiles]
+    """Files of every frame, including excluded frames. Pixel steps change these pixels for methods."""
     source_fingerprint: str
+    """Digest of the content of all files of the clip, independent of their location."""
     store: ImageStore
+    """Decodes images and bounds their memory; shared by clips derived from one another."""
     pixel_steps: tuple[PixelStep, ...] = ()
+    """Steps applied in order when a frame is read, with one rounding to 8 bits at the end."""
     read_background: FloatArray | None = None
+    """Colour that straight-alpha files are composited on before the pixel steps; None means `background`."""
     source: Clip | None = None
+    """The clip that gives the pixels of frames without files, see `as_capture`."""
 
     @cached_property
     def frame_at(self) -> Mapping[tuple[int, str], FrameKey]:

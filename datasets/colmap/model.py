@@ -50,22 +50,15 @@ _OUTSIDE = -1e4
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of a camera with distortion.
-
-    Attributes
-    ----------
-    model : str
-        COLMAP's name of the model: a pinhole, or a distortion that can be undone.
-    parameters : tuple[float, ...]
-        In COLMAP's order; lengths in pixels.
-    width, height : int
-        Image size, pixels.
-    """
+    """Intrinsics of a camera with distortion."""
 
     model: str
+    """COLMAP's name of the model: a pinhole, or a distortion that can be undone."""
     parameters: tuple[float, ...]
+    """In COLMAP's order; lengths in pixels."""
     width: int
     height: int
+    """Image size, pixels."""
 
     def __post_init__(self) -> None:
         """Raise `InputError` for an invalid lens."""

@@ -54,18 +54,12 @@ SEQUENCE = "drive"
 
 @dataclass(frozen=True, eq=False)
 class AvatarScene:
-    """An avatar's subject before a camera.
-
-    Attributes
-    ----------
-    clip : CaptureClip
-        Clip of the subject with one camera; its poses are replaced.
-    rest : RigidMean
-        Head pose at rest.
-    """
+    """An avatar's subject before a camera."""
 
     clip: CaptureClip
+    """Clip of the subject with one camera; its poses are replaced."""
     rest: RigidMean
+    """Head pose at rest."""
 
     @property
     def head(self) -> HeadArrays:

@@ -228,22 +228,15 @@ def _coefficients(source: Path, head: HeadArrays, sums: Mapping[str, FloatArray]
 
 @dataclass(frozen=True)
 class SignalFormat:
-    """A format of driving signals.
-
-    Attributes
-    ----------
-    name, summary : str
-        Name for ``--form``, and a description.
-    fits : Callable[[SignalTable], bool]
-        Whether a table without a map is of this format.
-    read : Callable[[SignalRequest], DrivingSignal]
-        Reader; its errors are `InputError`.
-    """
+    """A format of driving signals."""
 
     name: str
     summary: str
+    """Name for ``--form``, and a description."""
     fits: Callable[[SignalTable], bool]
+    """Whether a table without a map is of this format."""
     read: Callable[[SignalRequest], DrivingSignal]
+    """Reader; its errors are `InputError`."""
 
 
 FORMATS = (

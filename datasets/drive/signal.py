@@ -32,46 +32,30 @@ AVATAR = "avatar"
 
 @dataclass(frozen=True, eq=False)
 class DrivingSignal:
-    """A driving signal.
-
-    Attributes
-    ----------
-    form : str
-        Name of its format.
-    head : HeadArrays
-        Head model of its poses.
-    poses : Sequence[HeadPose]
-        One for each frame, at least one.
-    timing : Timing
-        Times of the poses.
-    unused : Mapping[str, str]
-        Channels of the signal that drive nothing, each with the reason.
-    """
+    """A driving signal."""
 
     form: str
+    """Name of its format."""
     head: HeadArrays
+    """Head model of its poses."""
     poses: Sequence[HeadPose]
+    """One for each frame, at least one."""
     timing: Timing
+    """Times of the poses."""
     unused: Mapping[str, str] = field(default_factory=dict)
+    """Channels of the signal that drive nothing, each with the reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class SignalRequest:
-    """Input of a reader of signals; see `settings.DriveSettings` for the fields of the same name.
-
-    Attributes
-    ----------
-    path : Path
-        File or folder of the signal.
-    target : HeadArrays
-        Head model of the avatar.
-    table : SignalTable | None
-        Content of a signal that is a table.
-    """
+    """Input of a reader of signals; see `settings.DriveSettings` for the fields of the same name."""
 
     path: Path
+    """File or folder of the signal."""
     target: HeadArrays
+    """Head model of the avatar."""
     table: SignalTable | None = None
+    """Content of a signal that is a table."""
     signal_head: str = ""
     map: str = ""
     sequence: str = ""

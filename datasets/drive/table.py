@@ -71,24 +71,16 @@ _FRAMES = "frames"
 
 @dataclass(frozen=True, eq=False)
 class SignalTable:
-    """Columns of a signal, not yet checked: each is converted when it is used.
-
-    Attributes
-    ----------
-    path : Path
-        File or folder, named in errors.
-    columns : Mapping[str, Sequence[Any] | np.ndarray]
-        T values by name: numbers, text, lists of numbers, or an array (T, ...).
-    places : Sequence[str]
-        Location of each of the T frames in the file, such as "line 7".
-    timing : Timing
-        Times of the T frames.
-    """
+    """Columns of a signal, not yet checked: each is converted when it is used."""
 
     path: Path
+    """File or folder, named in errors."""
     columns: Mapping[str, Sequence[Any] | np.ndarray]
+    """T values by name: numbers, text, lists of numbers, or an array (T, ...)."""
     places: Sequence[str]
+    """Location of each of the T frames in the file, such as "line 7"."""
     timing: Timing
+    """Times of the T frames."""
 
     def __len__(self) -> int:
         return len(self.places)

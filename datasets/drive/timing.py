@@ -39,24 +39,16 @@ ONE_FACE = "If these are two faces of one frame, keep those of one face."
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """When the frames of a signal were recorded.
-
-    Attributes
-    ----------
-    positions : FloatArray
-        (T,) increasing times of the frames, in frames since the first; a gap is a step above 1.
-    last : float
-        Time of the last frame of the signal; those at its ends may lack a face and a position.
-    fps : float | None
-        Frames per second, if the signal states them.
-    column : str
-        Column of a table that states the times, or "".
-    """
+    """When the frames of a signal were recorded."""
 
     positions: FloatArray
+    """(T,) increasing times of the frames, in frames since the first; a gap is a step above 1."""
     last: float
+    """Time of the last frame of the signal; those at its ends may lack a face and a position."""
     fps: float | None = None
+    """Frames per second, if the signal states them."""
     column: str = ""
+    """Column of a table that states the times, or ""."""
 
     @classmethod
     def regular(cls, count: int, fps: float | None = None) -> Timing:

@@ -36,21 +36,14 @@ FOCAL_TOLERANCE = 0.01  # relative, between fl_x and camera_angle_x
 
 @dataclass(frozen=True, eq=False)
 class CaptureCameras:
-    """Cameras of a capture and the shift of each sequence.
-
-    Attributes
-    ----------
-    views : Mapping[str, FrameEntry]
-        Representative frame entry by camera id, in the first sequence's world.
-    sizes : Mapping[str, tuple[int, int]]
-        (width, height) by camera id.
-    shifts : Mapping[str, FloatArray]
-        (3,) metres to add to positions of a sequence, by sequence folder; zero for the first.
-    """
+    """Cameras of a capture and the shift of each sequence."""
 
     views: Mapping[str, FrameEntry]
+    """Representative frame entry by camera id, in the first sequence's world."""
     sizes: Mapping[str, tuple[int, int]]
+    """(width, height) by camera id."""
     shifts: Mapping[str, FloatArray]
+    """(3,) metres to add to positions of a sequence, by sequence folder; zero for the first."""
 
     def resolve(self, cy: CyConvention) -> dict[str, Camera]:
         """`Camera` by id, with the given convention of the principal point."""

@@ -53,51 +53,36 @@ class HeadArrays:
     """A head model in FLAME's layout (a `HeadAsset`). Units: metres.
 
     V vertices, F triangles, S identity and E expression directions, J joints in the order of `JOINT_NAMES`.
-
-    Attributes
-    ----------
-    version : str
-        Name of the expression basis, equal to ``HeadPose.head_model`` of its poses.
-    template : FloatArray
-        (V, 3) mean head.
-    faces : IntArray
-        (F, 3) int64 triangles, counter-clockwise seen from outside.
-    shape_basis, expression_basis : FloatArray
-        (V, 3, S), (V, 3, E) metres per unit coefficient.
-    pose_basis : FloatArray
-        (V, 3, 9 (J-1)); column 9(j-1)+3r+c belongs to (R_j - I)[r, c].
-    joint_regressor : FloatArray
-        (J, V) dense; joints come from the shaped mesh.
-    skinning_weights : FloatArray
-        (V, J), rows sum to 1.
-    parents : IntArray
-        (J,), the root has -1 and every joint comes after its parent.
-    eyelid_basis : FloatArray | None
-        (V, 3, 2) left and right, added after skinning and rotated with root and neck; None if the model has none.
-    regions : Mapping[str, IntArray]
-        Vertex indices by name, unique; sorted except for `RING_REGIONS`.
-    landmarks : Mapping[str, int]
-        Vertex index by name; may be empty.
-    expression_names : tuple[str, ...]
-        Names of the expression directions, in order; () if they have none.
-    uv : FloatArray | None
-        (F, 3, 2) texture coordinates of the triangles' corners, in [0, 1] inside the chart; None if the model has no chart.
     """
 
     version: str
+    """Name of the expression basis, equal to ``HeadPose.head_model`` of its poses."""
     template: FloatArray
+    """(V, 3) mean head."""
     faces: IntArray
+    """(F, 3) int64 triangles, counter-clockwise seen from outside."""
     shape_basis: FloatArray
     expression_basis: FloatArray
+    """(V, 3, S), (V, 3, E) metres per unit coefficient."""
     pose_basis: FloatArray
+    """(V, 3, 9 (J-1)); column 9(j-1)+3r+c belongs to (R_j - I)[r, c]."""
     joint_regressor: FloatArray
+    """(J, V) dense; joints come from the shaped mesh."""
     skinning_weights: FloatArray
+    """(V, J), rows sum to 1."""
     parents: IntArray
+    """(J,), the root has -1 and every joint comes after its parent."""
     eyelid_basis: FloatArray | None = None
+    """(V, 3, 2) left and right, added after skinning and rotated with root and neck; None if the model has none."""
     regions: Mapping[str, IntArray] = field(default_factory=dict)
+    """Vertex indices by name, unique; sorted except for `RING_REGIONS`."""
     landmarks: Mapping[str, int] = field(default_factory=dict)
+    """Vertex index by name; may be empty."""
     expression_names: tuple[str, ...] = ()
+    """Names of the expression directions, in order; () if they have none."""
     uv: FloatArray | None = None
+    """(F, 3, 2) texture coordinates of the triangles' corners, in [0, 1] inside the chart; None if the model has no
+    chart."""
 
     def validate(self, file: str | PathLike[str]) -> HeadArrays:
         """Validate the model and return self.

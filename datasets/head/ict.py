@@ -285,19 +285,13 @@ Parts = Mapping[str, IntArray]
 
 @dataclass(frozen=True)
 class Profile:
-    """The head from the side: proportions that place the neck. Metres.
-
-    Attributes
-    ----------
-    length : float
-        Distance from nasion to chin.
-    neck_top, neck_base : float
-        Heights along the neck at which the head and the shoulders begin.
-    """
+    """The head from the side: proportions that place the neck. Metres."""
 
     length: float
+    """Distance from nasion to chin."""
     neck_top: float
     neck_base: float
+    """Heights along the neck at which the head and the shoulders begin."""
 
     # The neck leans forward by about 25 degrees: the throat begins lower than the nape.
     _UP = np.array([0.0, np.cos(0.43), np.sin(0.43)])

@@ -19,20 +19,13 @@ SPAN_VARIANCE = 0.99
 
 
 class Novelty(NamedTuple):
-    """Novelty of some expressions relative to those of training.
-
-    Attributes
-    ----------
-    outside : float
-        Fraction in [0, 1] of the root mean square displacement that lies outside the span of
-        training.
-    beyond : float
-        Fraction in [0, 1] of the expressions that leave the range of training along some direction of
-        its span by more than a tenth of that range.
-    """
+    """Novelty of some expressions relative to those of training."""
 
     outside: float
+    """Fraction in [0, 1] of the root mean square displacement that lies outside the span of training."""
     beyond: float
+    """Fraction in [0, 1] of the expressions that leave the range of training along some direction of its span by more
+    than a tenth of that range."""
 
 
 def displacement_metric(basis: FloatArray) -> FloatArray:
@@ -85,64 +78,43 @@ class SplitRow:
 
 @dataclass(frozen=True)
 class SequenceRow:
-    """Motion of one sequence. Excluded timesteps are only counted.
-
-    Attributes
-    ----------
-    held_out : bool
-        Whether its timesteps test self-reenactment.
-    jaw_deg : tuple[float, float, float]
-        Minimum, median and maximum opening of the jaw, degrees.
-    head_deg : float
-        Largest rotation of the head from its mean direction, degrees.
-    head_mm : float
-        Largest distance of the head from its mean position, millimetres.
-    expression_sigma : float
-        Root mean square over timesteps of the coefficients' length over sqrt(E): 1 if every
-        coefficient has a standard deviation of 1.
-    reach_mm : tuple[float, float]
-        Median and maximum displacement of the farthest-moving vertex by expression alone,
-        millimetres.
-    """
+    """Motion of one sequence. Excluded timesteps are only counted."""
 
     sequence: str
     held_out: bool
+    """Whether its timesteps test self-reenactment."""
     timesteps: int
     excluded: int
     jaw_deg: tuple[float, float, float]
+    """Minimum, median and maximum opening of the jaw, degrees."""
     head_deg: float
+    """Largest rotation of the head from its mean direction, degrees."""
     head_mm: float
+    """Largest distance of the head from its mean position, millimetres."""
     expression_sigma: float
+    """Root mean square over timesteps of the coefficients' length over sqrt(E): 1 if every coefficient has a standard
+    deviation of 1."""
     largest_coefficient: float
     reach_mm: tuple[float, float]
+    """Median and maximum displacement of the farthest-moving vertex by expression alone, millimetres."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExpressionSpace:
-    """Principal components of the face's displacement by expression, over the training timesteps.
-
-    Attributes
-    ----------
-    timesteps : Sequence[int]
-        Timesteps of the capture without excluded ones.
-    held_out : np.ndarray
-        (T,) whether a timestep is held out.
-    scores_mm : FloatArray
-        (T, K) root-mean-square displacement of the face's vertices along each component.
-    explained : FloatArray
-        (K,) fraction of the training variance.
-    novelty_mm : Mapping[int, float]
-        RMS distance of the face to the nearest training face, by held-out timestep.
-    novelty : Mapping[str, Novelty]
-        Novelty of each held-out sequence against training.
-    """
+    """Principal components of the face's displacement by expression, over the training timesteps."""
 
     timesteps: Sequence[int]
+    """Timesteps of the capture without excluded ones."""
     held_out: np.ndarray
+    """(T,) whether a timestep is held out."""
     scores_mm: FloatArray
+    """(T, K) root-mean-square displacement of the face's vertices along each component."""
     explained: FloatArray
+    """(K,) fraction of the training variance."""
     novelty_mm: Mapping[int, float]
+    """RMS distance of the face to the nearest training face, by held-out timestep."""
     novelty: Mapping[str, Novelty]
+    """Novelty of each held-out sequence against training."""
 
     @cached_property
     def kept(self) -> int:

@@ -33,30 +33,21 @@ SAME_INTRINSICS = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class VideoFrame:
-    """One frame of a layout, in this project's units and axes.
-
-    Attributes
-    ----------
-    where : tuple[Path, str]
-        File and entry, for messages.
-    sequence, number : str, int
-        The video's name, and the frame's number in its file name.
-    image, mask : Path, Path | None
-        Files; the mask is the image itself if that has straight alpha.
-    inside : Path | None
-        A second mask; the coverage is the product of the two.
-    pose : HeadPose
-        Pose in the world that ``camera`` maps from; its timestep is not set yet.
-    """
+    """One frame of a layout, in this project's units and axes."""
 
     where: tuple[Path, str]
+    """File and entry, for messages."""
     sequence: str
     number: int
+    """The video's name, and the frame's number in its file name."""
     image: Path
     mask: Path | None
+    """Files; the mask is the image itself if that has straight alpha."""
     camera: Camera
     pose: HeadPose
+    """Pose in the world that ``camera`` maps from; its timestep is not set yet."""
     inside: Path | None = None
+    """A second mask; the coverage is the product of the two."""
 
     @property
     def name(self) -> tuple[str, int]:
@@ -66,31 +57,21 @@ class VideoFrame:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A tracked video, or several of one subject.
-
-    Attributes
-    ----------
-    frames : Sequence[VideoFrame]
-        Sorted by `VideoFrame.name`, without duplicates.
-    shape : FloatArray
-        (S,) identity coefficients of the head model.
-    solid : tuple[float, float] | None
-        Coverage range (low, high] in [0, 1] that becomes 1, all else 0, as in the layout's own loader; None keeps masks
-        unchanged.
-    held_out : frozenset[tuple[str, int]] | None
-        Names of the frames that the layout holds out; None if it does not define a split.
-    files : frozenset[Path]
-        All files that were read, except images.
-    notes : Mapping[str, Any]
-        Properties that the layout does not define, and the choices made.
-    """
+    """A tracked video, or several of one subject."""
 
     frames: Sequence[VideoFrame]
+    """Sorted by `VideoFrame.name`, without duplicates."""
     shape: FloatArray
+    """(S,) identity coefficients of the head model."""
     held_out: frozenset[tuple[str, int]] | None
+    """Names of the frames that the layout holds out; None if it does not define a split."""
     files: frozenset[Path]
+    """All files that were read, except images."""
     notes: Mapping[str, Any] = field(default_factory=dict)
+    """Properties that the layout does not define, and the choices made."""
     solid: tuple[float, float] | None = None
+    """Coverage range (low, high] in [0, 1] that becomes 1, all else 0, as in the layout's own loader; None keeps masks
+    unchanged."""
 
 
 def ordered(root: Path, frames: Sequence[VideoFrame]) -> list[VideoFrame]:

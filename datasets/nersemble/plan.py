@@ -41,25 +41,17 @@ _FLAME_VERSIONS = ("flame2020", _USUAL_HEAD, "flame2023_no_jaw", OPEN)
 
 @dataclass(frozen=True, eq=False)
 class SequenceJob:
-    """One sequence to prepare.
-
-    Attributes
-    ----------
-    cameras : Sequence[Camera]
-        Cameras of the prepared images in index order, in the aligned world.
-    corrections : Mapping[str, Correction]
-        Colour correction by serial; empty for none.
-    stills : Mapping[str, Path]
-        Images of the empty set by serial, used to remove its light from soft edges; empty to skip this.
-    tracked : TrackedSequence | None
-        Parameters, or None if there are none yet.
-    """
+    """One sequence to prepare."""
 
     recorded: RecordedSequence
     cameras: Sequence[Camera]
+    """Cameras of the prepared images in index order, in the aligned world."""
     corrections: Mapping[str, Correction]
+    """Colour correction by serial; empty for none."""
     stills: Mapping[str, Path]
+    """Images of the empty set by serial, used to remove its light from soft edges; empty to skip this."""
     tracked: TrackedSequence | None
+    """Parameters, or None if there are none yet."""
     folder: Path
 
     @property

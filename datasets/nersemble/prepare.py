@@ -211,26 +211,18 @@ class SequenceState:
 
 @dataclass(frozen=True)
 class SubjectResult:
-    """Result for a subject.
-
-    Attributes
-    ----------
-    written, kept : int
-        Number of images.
-    frames : dict[str, int]
-        Frames per split of the union; empty where there is none.
-    union : Path | None
-        The folder to give to a reader, or None.
-    missing : tuple[str, ...]
-        Reasons why the capture is not complete, one sentence each.
-    """
+    """Result for a subject."""
 
     subject: str
     written: int
     kept: int
+    """Number of images."""
     frames: dict[str, int]
+    """Frames per split of the union; empty where there is none."""
     union: Path | None
+    """The folder to give to a reader, or None."""
     missing: tuple[str, ...]
+    """Reasons why the capture is not complete, one sentence each."""
 
 
 def prepare(

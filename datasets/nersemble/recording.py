@@ -48,27 +48,18 @@ _AVAILABLE = ("x", "m")
 
 @dataclass(frozen=True, eq=False)
 class Participant:
-    """One participant's folder in a recording.
-
-    Attributes
-    ----------
-    subject : str
-        Three-digit id.
-    calibration_file : Path
-        ``camera_params.json``.
-    sequences : Mapping[str, Path]
-        Folder by full sequence name, without ``BACKGROUND``.
-    backgrounds : Mapping[str, Path]
-        Still of the empty set by serial.
-    listed : tuple[str, ...]
-        Sequences that the release's metadata lists; empty without metadata.
-    """
+    """One participant's folder in a recording."""
 
     subject: str
+    """Three-digit id."""
     calibration_file: Path
+    """``camera_params.json``."""
     sequences: Mapping[str, Path]
+    """Folder by full sequence name, without ``BACKGROUND``."""
     backgrounds: Mapping[str, Path] = field(default_factory=dict)
+    """Still of the empty set by serial."""
     listed: tuple[str, ...] = ()
+    """Sequences that the release's metadata lists; empty without metadata."""
     colour_file: Path | None = None
     colour_folder: Path | None = None
 
@@ -178,24 +169,16 @@ def _listed_sequences(root: Path) -> dict[str, tuple[str, ...]]:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Cameras by serial, in the file's order, which is the order of camera indices.
-
-    Attributes
-    ----------
-    file : Path
-        Source of the values, for error messages.
-    world_to_camera : Mapping[str, FloatArray]
-        (4, 4) by serial.
-    intrinsics : Mapping[str, FloatArray]
-        (3, 3) by serial, pixels of an image of ``size``.
-    size : tuple[int, int] | None
-        (width, height) that the intrinsics refer to; None if they refer to the images as they are.
-    """
+    """Cameras by serial, in the file's order, which is the order of camera indices."""
 
     file: Path
+    """Source of the values, for error messages."""
     world_to_camera: Mapping[str, FloatArray]
+    """(4, 4) by serial."""
     intrinsics: Mapping[str, FloatArray]
+    """(3, 3) by serial, pixels of an image of ``size``."""
     size: tuple[int, int] | None
+    """(width, height) that the intrinsics refer to; None if they refer to the images as they are."""
 
     @property
     def serials(self) -> list[str]:

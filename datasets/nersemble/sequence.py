@@ -38,31 +38,21 @@ _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 
 @dataclass(frozen=True, eq=False)
 class RecordedView:
-    """The recording of one camera.
-
-    Attributes
-    ----------
-    serial : str
-        Serial number of the camera.
-    video : Path | None
-        The video, or None if the frames are image files.
-    images : Mapping[int, Path]
-        Image file by frame number; empty for a video.
-    count : int
-        Number of frames.
-    size : tuple[int, int]
-        (width, height).
-    mask_video, masks : Path | None, Mapping[int, Path]
-        Foreground coverage in the same form as the frames, if present.
-    """
+    """The recording of one camera."""
 
     serial: str
+    """Serial number of the camera."""
     video: Path | None = None
+    """The video, or None if the frames are image files."""
     images: Mapping[int, Path] = field(default_factory=dict)
+    """Image file by frame number; empty for a video."""
     count: int = 0
+    """Number of frames."""
     size: tuple[int, int] = (0, 0)
+    """(width, height)."""
     mask_video: Path | None = None
     masks: Mapping[int, Path] | None = None
+    """Foreground coverage in the same form as the frames, if present."""
 
     @property
     def has_masks(self) -> bool:

@@ -37,17 +37,7 @@ from .names import (
 
 @dataclass(frozen=True)
 class UnionReport:
-    """Summary of a union folder.
-
-    Attributes
-    ----------
-    notes : tuple[str, ...]
-        Unusual but readable properties.
-    free : str
-        The sequence folder of FREE beside it, or "".
-    rejoined : str
-        The written union with the paper's split, or "".
-    """
+    """Summary of a union folder."""
 
     subject: str
     folder: str = ""
@@ -57,8 +47,11 @@ class UnionReport:
     cameras: int = 0
     fault: str = ""
     notes: tuple[str, ...] = ()
+    """Unusual but readable properties."""
     free: str = ""
+    """The sequence folder of FREE beside it, or ""."""
     rejoined: str = ""
+    """The written union with the paper's split, or ""."""
 
 
 def check_unions(
@@ -181,22 +174,14 @@ _RESULT = re.compile(r"tracked_flame_params_(\d+)\.npz")
 
 @dataclass(frozen=True, eq=False)
 class TrackedSequence:
-    """Parameters of T timesteps, in the aligned world.
-
-    Attributes
-    ----------
-    file : Path
-        Source of the values.
-    frames : Mapping[str, FloatArray]
-        Arrays with T rows: those of `POSE_SIZES`, ``expr``, and ``dynamic_offset`` and ``eyelids`` if
-        present.
-    constant : Mapping[str, FloatArray]
-        ``shape`` (S,) and ``static_offset`` (1, V, 3), zeros if the tracker wrote none.
-    """
+    """Parameters of T timesteps, in the aligned world."""
 
     file: Path
+    """Source of the values."""
     frames: Mapping[str, FloatArray]
+    """Arrays with T rows: those of `POSE_SIZES`, ``expr``, and ``dynamic_offset`` and ``eyelids`` if present."""
     constant: Mapping[str, FloatArray]
+    """``shape`` (S,) and ``static_offset`` (1, V, 3), zeros if the tracker wrote none."""
 
     @property
     def count(self) -> int:

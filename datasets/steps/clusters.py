@@ -137,30 +137,20 @@ _DIGITS = 6  # number of digits to which relative distances of one face are equa
 
 @dataclass(frozen=True, eq=False)
 class ExpressionClusters:
-    """Class of each training timestep.
-
-    Attributes
-    ----------
-    timesteps : IntArray
-        (T,) sorted training timesteps.
-    labels : IntArray
-        (T,) class of each, from 0; no class is empty.
-    medoids : IntArray
-        (classes,) timestep of each class that is nearest to its centre in the spectral embedding.
-    landmarks : int
-        Number of landmark timesteps; T if all pairs were compared.
-    radius : float
-        Metres within which every face has a landmark; 0 if all pairs were compared.
-    variant : str
-        "official" for the published behaviour.
-    """
+    """Class of each training timestep."""
 
     timesteps: IntArray
+    """(T,) sorted training timesteps."""
     labels: IntArray
+    """(T,) class of each, from 0; no class is empty."""
     medoids: IntArray
+    """(classes,) timestep of each class that is nearest to its centre in the spectral embedding."""
     landmarks: int
+    """Number of landmark timesteps; T if all pairs were compared."""
     radius: float
+    """Metres within which every face has a landmark; 0 if all pairs were compared."""
     variant: str = "paper"
+    """"official" for the published behaviour."""
 
     @property
     def by_timestep(self) -> dict[int, int]:

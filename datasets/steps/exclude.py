@@ -140,27 +140,18 @@ class FrameDecision:
 
 @dataclass(frozen=True, eq=False)
 class Exclusions:
-    """Decisions on one subject.
-
-    Attributes
-    ----------
-    threshold : float
-        Minimum score of excluded frames.
-    basis : str
-        How the threshold was found.
-    cameras : tuple[str, ...]
-        Cameras that were evaluated.
-    frames : Mapping[int, FrameDecision]
-        Decision by timestep.
-    overrides : Mapping[int, str]
-        Manual decision by timestep: "keep", or the reason to exclude the frame.
-    """
+    """Decisions on one subject."""
 
     threshold: float
+    """Minimum score of excluded frames."""
     basis: str
+    """How the threshold was found."""
     cameras: tuple[str, ...]
+    """Cameras that were evaluated."""
     frames: Mapping[int, FrameDecision]
+    """Decision by timestep."""
     overrides: Mapping[int, str] = field(default_factory=dict)
+    """Manual decision by timestep: "keep", or the reason to exclude the frame."""
 
     def reasons(self) -> dict[int, str]:
         """Reason by excluded timestep, with overrides applied."""

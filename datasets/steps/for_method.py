@@ -50,18 +50,12 @@ class PixelBox:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Pixel-exact conversion of images of one size to those of a `ResolutionRule`, and its inverse.
-
-    Attributes
-    ----------
-    source : Size
-        (width, height) of the original images.
-    moves : tuple[Resize | PixelBox, ...]
-        Operations, applied in this order.
-    """
+    """Pixel-exact conversion of images of one size to those of a `ResolutionRule`, and its inverse."""
 
     source: Size
+    """(width, height) of the original images."""
     moves: tuple[Resize | PixelBox, ...]
+    """Operations, applied in this order."""
 
     @classmethod
     def of(cls, source: Size, rule: ResolutionRule) -> Alignment:

@@ -25,21 +25,14 @@ TONGUE_SECTIONS, TONGUE_SECTORS = 18, 16
 
 @dataclass(frozen=True, eq=False)
 class MouthMesh:
-    """A mesh that moves with the head's joints and has no expression of its own.
-
-    Attributes
-    ----------
-    name : str
-        "upper_teeth", "lower_teeth", "upper_gums", "lower_gums" or "tongue".
-    vertices : FloatArray
-        (n, 3) in the neutral shape, metres.
-    faces : IntArray
-        (f, 3), counter-clockwise seen from outside.
-    """
+    """A mesh that moves with the head's joints and has no expression of its own."""
 
     name: str
+    """"upper_teeth", "lower_teeth", "upper_gums", "lower_gums" or "tongue"."""
     vertices: FloatArray
+    """(n, 3) in the neutral shape, metres."""
     faces: IntArray
+    """(f, 3), counter-clockwise seen from outside."""
     skinning_weights: FloatArray
     material: str
 

@@ -431,27 +431,18 @@ ROUNDING = 0.6  # share of the full projection; Boubekeur and Alexa use 3/4
 
 @dataclass(frozen=True, eq=False)
 class FineMesh:
-    """Points bound to the triangles of a tracked mesh.
-
-    Attributes
-    ----------
-    faces : IntArray
-        (F', 3) triangles over the fine points.
-    parents : IntArray
-        (N, 3) vertex indices into the tracked mesh.
-    weights : FloatArray
-        (N, 3) barycentric weights, rows sum to 1.
-    parent_faces : IntArray
-        (N,) tracked triangle a point lies on (one of them for points on an edge).
-    coarse_faces : IntArray
-        (F, 3) the tracked triangles that were refined.
-    """
+    """Points bound to the triangles of a tracked mesh."""
 
     faces: IntArray
+    """(F', 3) triangles over the fine points."""
     parents: IntArray
+    """(N, 3) vertex indices into the tracked mesh."""
     weights: FloatArray
+    """(N, 3) barycentric weights, rows sum to 1."""
     parent_faces: IntArray
+    """(N,) tracked triangle a point lies on (one of them for points on an edge)."""
     coarse_faces: IntArray
+    """(F, 3) the tracked triangles that were refined."""
 
     def interpolate(self, values: FloatArray) -> FloatArray:
         """Values at the tracked vertices, (V, ...) -> at the fine points, (N, ...)."""

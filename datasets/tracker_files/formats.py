@@ -115,30 +115,20 @@ def pixel3dmm_frame(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -
 
 @dataclass(frozen=True)
 class TrackerFormat:
-    """A tracker's files.
-
-    Attributes
-    ----------
-    name : str
-        As in ``--format``.
-    summary : str
-        One line for help and messages.
-    mark : str
-        Name of an array that only files of this tracker have.
-    members : Mapping[str, Member]
-        Arrays of a file that are read.
-    convert : Convert
-        Makes a timestep of them.
-    layout : Layout
-        Locations of images and masks.
-    """
+    """A tracker's files."""
 
     name: str
+    """As in ``--format``."""
     summary: str
+    """One line for help and messages."""
     mark: str
+    """Name of an array that only files of this tracker have."""
     members: Mapping[str, Member]
+    """Arrays of a file that are read."""
     convert: Convert
+    """Makes a timestep of them."""
     layout: Layout
+    """Locations of images and masks."""
 
 
 FORMATS = {

@@ -26,28 +26,19 @@ INSIDE, INSIDE_SUFFIX = "parsing", "_neckhead"
 
 @dataclass(frozen=True)
 class Layout:
-    """Locations of a tracker's images and masks.
-
-    Attributes
-    ----------
-    images : Mapping[str, int | None]
-        Folders of images, the first of which that exists is taken, and the number of the image of frame 0; None takes the
-        lowest number in the folder.
-    masks : tuple[str, ...]
-        Folders of masks beside that of the images.
-    labels : str
-        Folder of label images beside that of the images; "" for none.
-    subject : tuple[int, int]
-        First and last label of the subject.
-    resized : bool
-        Whether images may be larger than the ones tracked, with the same ratio of width to height.
-    """
+    """Locations of a tracker's images and masks."""
 
     images: Mapping[str, int | None]
+    """Folders of images, the first of which that exists is taken, and the number of the image of frame 0; None takes
+    the lowest number in the folder."""
     masks: tuple[str, ...] = ()
+    """Folders of masks beside that of the images."""
     labels: str = ""
+    """Folder of label images beside that of the images; "" for none."""
     subject: tuple[int, int] = (1, 255)
+    """First and last label of the subject."""
     resized: bool = False
+    """Whether images may be larger than the ones tracked, with the same ratio of width to height."""
 
 
 class Picture(NamedTuple):
@@ -213,37 +204,27 @@ class TrackedFrame:
     """One timestep as a tracker found it, in this project's units and axes; the same for all trackers.
 
     The head's root is at rest in the world of ``world_to_camera``: its motion is in the camera.
-
-    Attributes
-    ----------
-    file, number : Path, int
-        The tracker's file and the number in its name.
-    width, height : int
-        Size of the image that was tracked, pixels.
-    K : FloatArray
-        (3, 3), pixels of that image; its upper left corner is (0, 0).
-    world_to_camera : FloatArray
-        (4, 4) rigid motion, metres, OpenCV axes.
-    shape, expression : FloatArray
-        Coefficients, as many as the tracker has.
-    neck, jaw, eyes : FloatArray
-        (3,), (3,), (6,) axis-angle; eyes left, then right.
-    eyelids : FloatArray
-        (2,) left, right.
     """
 
     file: Path
     number: int
+    """The tracker's file and the number in its name."""
     width: int
     height: int
+    """Size of the image that was tracked, pixels."""
     K: FloatArray
+    """(3, 3), pixels of that image; its upper left corner is (0, 0)."""
     world_to_camera: FloatArray
+    """(4, 4) rigid motion, metres, OpenCV axes."""
     shape: FloatArray
     expression: FloatArray
+    """Coefficients, as many as the tracker has."""
     neck: FloatArray
     jaw: FloatArray
     eyes: FloatArray
+    """(3,), (3,), (6,) axis-angle; eyes left, then right."""
     eyelids: FloatArray
+    """(2,) left, right."""
 
 
 Convert = Callable[[Path, int, Mapping[str, np.ndarray]], TrackedFrame]

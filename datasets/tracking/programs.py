@@ -31,18 +31,12 @@ STEPS, LOG = "steps.json", "program.log"
 
 @dataclass(frozen=True)
 class WorkingFolder:
-    """Working folder of a program.
-
-    Attributes
-    ----------
-    folder : Path
-        For everything that the program writes; absolute.
-    video : Path
-        The file of the video in it, named by the subject.
-    """
+    """Working folder of a program."""
 
     folder: Path
+    """For everything that the program writes; absolute."""
     video: Path
+    """The file of the video in it, named by the subject."""
 
     @property
     def name(self) -> str:
@@ -52,51 +46,34 @@ class WorkingFolder:
 
 @dataclass(frozen=True)
 class Step:
-    """One of a program's commands.
-
-    Attributes
-    ----------
-    name : str
-        For messages.
-    arguments : Callable
-        Arguments of the interpreter, in the checkout's folder: a script and its arguments.
-    output : str
-        Pattern of files in the working folder of which one exists afterwards; programs may fail with exit code 0. It contains
-        ``{name}`` for the name of the video.
-    """
+    """One of a program's commands."""
 
     name: str
+    """For messages."""
     arguments: Callable[[WorkingFolder], list[str]]
+    """Arguments of the interpreter, in the checkout's folder: a script and its arguments."""
     output: str
+    """Pattern of files in the working folder of which one exists afterwards; programs may fail with exit code 0. It
+    contains ``{name}`` for the name of the video."""
 
 
 @dataclass(frozen=True)
 class TrackingProgram:
-    """A tracker.
-
-    Attributes
-    ----------
-    url, commit : str
-        Its repository, and the commit that the commands are of.
-    steps : tuple[Step, ...]
-        In order.
-    variables : Callable
-        Environment variables in addition to those of `run_program`, of checkout and work.
-    modules : tuple[str, ...]
-        Modules that its interpreter must be able to import.
-    files : tuple[str, ...]
-        Files of the checkout that it distributes separately, such as weights, with the remedy if one is missing.
-    remedy : str
-        How to get them.
-    """
+    """A tracker."""
 
     url: str
     commit: str
+    """Its repository, and the commit that the commands are of."""
     steps: tuple[Step, ...]
+    """In order."""
     variables: Callable[[Path, WorkingFolder], Mapping[str, str]]
+    """Environment variables in addition to those of `run_program`, of checkout and work."""
     modules: tuple[str, ...]
+    """Modules that its interpreter must be able to import."""
     files: tuple[str, ...]
+    """Files of the checkout that it distributes separately, such as weights, with the remedy if one is missing."""
     remedy: str
+    """How to get them."""
 
 
 def _no_variables(checkout: Path, work: WorkingFolder) -> Mapping[str, str]:

@@ -233,24 +233,17 @@ class FaceFollower:
     `SPEED`); every farther one is another's. That a face found again is the same person's is not known, see `FoundFaces.again`.
 
     Landmarks are rounded to 32 bits, as they are stored, so that an interruption does not change them.
-
-    Attributes
-    ----------
-    last : FloatArray | None
-        (COUNT, 2) landmarks of the person where they were last seen, pixels.
-    last_time : float
-        Time of that frame, seconds.
-    lost : bool
-        Whether the person is missing in the latest frame.
-    others : list[FloatArray]
-        (COUNT, 2) landmarks of every other face of the latest frame.
     """
 
     finder: FaceFinder
     last: FloatArray | None = None
+    """(COUNT, 2) landmarks of the person where they were last seen, pixels."""
     last_time: float = 0.0
+    """Time of that frame, seconds."""
     lost: bool = True
+    """Whether the person is missing in the latest frame."""
     others: list[FloatArray] = field(default_factory=list)
+    """(COUNT, 2) landmarks of every other face of the latest frame."""
 
     def follow(self, image: ByteArray, time: float, search: bool) -> FloatArray | None:
         """The person's landmarks in the next frame, (COUNT, 2) pixels, or None.

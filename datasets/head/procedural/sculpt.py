@@ -42,21 +42,14 @@ LOW, HIGH = (0.0, FLOOR, -0.13), (0.115, 0.15, 0.11)
 
 @dataclass(frozen=True)
 class SculptSettings:
-    """Settings of the sculptor.
-
-    Attributes
-    ----------
-    out : Path
-        Output npz: ``vertices`` (V, 3) float32 metres, ``faces`` (F, 3) int32, ``mirror`` (V,) int32.
-    step : float
-        Voxel size of the fine surface, metres.
-    detail : float
-        Factor on the wanted edge lengths; smaller is finer.
-    """
+    """Settings of the sculptor."""
 
     out: Path
+    """Output npz: ``vertices`` (V, 3) float32 metres, ``faces`` (F, 3) int32, ``mirror`` (V,) int32."""
     step: float = 0.0007
+    """Voxel size of the fine surface, metres."""
     detail: float = 1.13
+    """Factor on the wanted edge lengths; smaller is finer."""
 
 
 def edge_length(points: FloatArray) -> FloatArray:

@@ -37,24 +37,16 @@ PACKAGED = Path(__file__).with_name("head.npz")
 
 @dataclass(frozen=True, eq=False)
 class SculptedHead:
-    """Skin, left eyeball, right eyeball, in this order.
-
-    Attributes
-    ----------
-    vertices : FloatArray
-        (V, 3) float64, metres.
-    faces : IntArray
-        (F, 3) int64, counter-clockwise seen from outside.
-    mirror : IntArray
-        (V,) index of the mirror image of each vertex.
-    skin_count : int
-        Number of skin vertices; each eyeball has half of the rest.
-    """
+    """Skin, left eyeball, right eyeball, in this order."""
 
     vertices: FloatArray
+    """(V, 3) float64, metres."""
     faces: IntArray
+    """(F, 3) int64, counter-clockwise seen from outside."""
     mirror: IntArray
+    """(V,) index of the mirror image of each vertex."""
     skin_count: int
+    """Number of skin vertices; each eyeball has half of the rest."""
 
     @cached_property
     def eyeballs(self) -> tuple[IntArray, IntArray]:

@@ -37,27 +37,18 @@ _MILLIMETRES = 1e3
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """Vertices of the target with their counterparts on the source.
-
-    Attributes
-    ----------
-    vertices : IntArray
-        (n,) vertices of the target, ascending.
-    weights : FloatArray
-        (n,) weights of their squared distances.
-    counterparts : csr_array
-        (n, V source) sparse; maps the source's vertices to points on its surface.
-    alignment : FloatArray
-        (4, 4) rigid motion from the source's model space to the target's.
-    shape : FloatArray
-        (S,) identity of the target.
-    """
+    """Vertices of the target with their counterparts on the source."""
 
     vertices: IntArray
+    """(n,) vertices of the target, ascending."""
     weights: FloatArray
+    """(n,) weights of their squared distances."""
     counterparts: csr_array
+    """(n, V source) sparse; maps the source's vertices to points on its surface."""
     alignment: FloatArray
+    """(4, 4) rigid motion from the source's model space to the target's."""
     shape: FloatArray
+    """(S,) identity of the target."""
 
 
 def fitted_vertices(head: HeadAsset, settings: RefitSettings) -> tuple[IntArray, FloatArray]:

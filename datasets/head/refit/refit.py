@@ -316,29 +316,19 @@ class FrameResidual:
 
 @dataclass(frozen=True, eq=False)
 class RefitReport:
-    """Residuals of a whole clip.
-
-    Attributes
-    ----------
-    source, target : str
-        Versions of the head models.
-    frames : Sequence[FrameResidual]
-        One for each timestep, ascending.
-    vertex_mm : FloatArray
-        (V,) mean residual of the target's vertices over the timesteps; NaN for vertices that were not
-        fitted.
-    neutral_mm : float
-        Mean distance of the neutral heads over the facial region.
-    shape_at_bound : tuple[str, ...]
-        Identity coefficients that ended at their bound.
-    """
+    """Residuals of a whole clip."""
 
     source: str
     target: str
+    """Versions of the head models."""
     frames: Sequence[FrameResidual]
+    """One for each timestep, ascending."""
     vertex_mm: FloatArray
+    """(V,) mean residual of the target's vertices over the timesteps; NaN for vertices that were not fitted."""
     neutral_mm: float
+    """Mean distance of the neutral heads over the facial region."""
     shape_at_bound: tuple[str, ...]
+    """Identity coefficients that ended at their bound."""
 
     def summary(self) -> dict[str, Any]:
         """Means over the timesteps and the worst one, as plain values."""

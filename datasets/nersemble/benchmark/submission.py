@@ -47,26 +47,18 @@ class Video(NamedTuple):
 
 @dataclass(frozen=True)
 class BenchmarkTrack:
-    """A task of the benchmark.
-
-    Attributes
-    ----------
-    name : TrackName
-        Name of the folder in the benchmark's data.
-    size : tuple[int, int]
-        (width, height) in pixels.
-    sequences : Mapping[str, Mapping[str, int | None]]
-        Sequences to render, by participant, with the number of frames if it is published.
-    totals : Mapping[str, int] | None
-        Published number of frames of all sequences of a participant together.
-    """
+    """A task of the benchmark."""
 
     name: TrackName
+    """Name of the folder in the benchmark's data."""
     size: tuple[int, int]
+    """(width, height) in pixels."""
     fps: float
     sequences: Mapping[str, Mapping[str, int | None]]
+    """Sequences to render, by participant, with the number of frames if it is published."""
     serials: tuple[str, ...]
     totals: Mapping[str, int] | None = None
+    """Published number of frames of all sequences of a participant together."""
 
     def videos(self, data: Path | None = None) -> Iterator[Video]:
         """All videos of a submission.

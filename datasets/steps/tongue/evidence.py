@@ -50,24 +50,16 @@ _LIMIT = 6.0  # upper limit of standard deviations
 
 @dataclass(frozen=True, eq=False)
 class MouthEvidence:
-    """Evidence in T timesteps.
-
-    Attributes
-    ----------
-    areas : FloatArray
-        (T,) mm² of the largest covered patch that begins at the mouth; 0 without one.
-    patches : np.ndarray
-        (T, H, W) pixels of that patch.
-    strength : FloatArray
-        (T, H, W) float16 standard deviations by which each pixel looks covered; 0 if not seen.
-    seen : FloatArray
-        (T,) fraction of the lower lip visible to some camera.
-    """
+    """Evidence in T timesteps."""
 
     areas: FloatArray
+    """(T,) mm² of the largest covered patch that begins at the mouth; 0 without one."""
     patches: np.ndarray
+    """(T, H, W) pixels of that patch."""
     strength: FloatArray
+    """(T, H, W) float16 standard deviations by which each pixel looks covered; 0 if not seen."""
     seen: FloatArray
+    """(T,) fraction of the lower lip visible to some camera."""
 
 
 def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> MouthEvidence:

@@ -45,33 +45,22 @@ _FAR = 50.0  # metres; from there perspective is below a tenth of a millimetre
 
 @dataclass(frozen=True, eq=False)
 class MouthAtlas:
-    """A frontal map of the surface around a subject's mouth, H x W pixels of `PITCH`, row 0 on top.
-
-    Attributes
-    ----------
-    inside : np.ndarray
-        (H, W) whether the map has surface: the face's outside, facing front.
-    corners : IntArray
-        (N, 3) vertices of the triangle behind each pixel of ``inside``, in row-major order.
-    weights : FloatArray
-        (N, 3) barycentric weights on them.
-    lips : np.ndarray
-        (H, W) pixels of the lips.
-    below : np.ndarray
-        (H, W) pixels below the line where the lips meet: lower lip and chin.
-    height : FloatArray
-        (H, W) millimetres above the line where the lips meet, negative below.
-    occluders : IntArray
-        (F', 3) triangles that can hide the mouth from a camera in front of it.
-    """
+    """A frontal map of the surface around a subject's mouth, H x W pixels of `PITCH`, row 0 on top."""
 
     inside: np.ndarray
+    """(H, W) whether the map has surface: the face's outside, facing front."""
     corners: IntArray
+    """(N, 3) vertices of the triangle behind each pixel of ``inside``, in row-major order."""
     weights: FloatArray
+    """(N, 3) barycentric weights on them."""
     lips: np.ndarray
+    """(H, W) pixels of the lips."""
     below: np.ndarray
+    """(H, W) pixels below the line where the lips meet: lower lip and chin."""
     height: FloatArray
+    """(H, W) millimetres above the line where the lips meet, negative below."""
     occluders: IntArray
+    """(F', 3) triangles that can hide the mouth from a camera in front of it."""
 
     def points(self, vertices: FloatArray) -> FloatArray:
         """(N, 3) places of the map's pixels on a posed mesh (V, 3), metres."""
@@ -186,24 +175,16 @@ _MESHES = 32  # posed at once
 
 @dataclass(frozen=True, eq=False)
 class MouthColours:
-    """Colours of T timesteps in up to C cameras, in the map's layout.
-
-    Attributes
-    ----------
-    timesteps : Sequence[int]
-        Sorted timesteps.
-    cameras : Sequence[str]
-        Camera ids by position.
-    colours : ByteArray
-        (T, C, H, W, 3) 8-bit sRGB; 0 if not seen.
-    seen : np.ndarray
-        (T, C, H, W).
-    """
+    """Colours of T timesteps in up to C cameras, in the map's layout."""
 
     timesteps: Sequence[int]
+    """Sorted timesteps."""
     cameras: Sequence[str]
+    """Camera ids by position."""
     colours: ByteArray
+    """(T, C, H, W, 3) 8-bit sRGB; 0 if not seen."""
     seen: np.ndarray
+    """(T, C, H, W)."""
 
 
 def frames_by_timestep(clip: Clip) -> dict[int, dict[str, FrameKey]]:
