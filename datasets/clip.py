@@ -324,8 +324,7 @@ def check_apart(clip: CaptureClip, out: Path) -> None:
 def as_capture(clip: Clip) -> CaptureClip:
     """Any clip as a `CaptureClip` for steps and commands; a `CaptureClip` is returned unchanged.
 
-    Pixels are read from ``clip``. Raises `InputError` if its head model is not in FLAME's layout, or the subject's
-    identity or a pose has another size.
+    Pixels are read from ``clip``.
     """
     if isinstance(clip, CaptureClip):
         return clip

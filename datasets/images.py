@@ -76,10 +76,7 @@ class ImageStore:
 
 
 def read_image(path: Path, background: Iterable[float]) -> ByteArray:
-    """Decode a PNG or JPEG to (H, W, 3) RGB, straight alpha composited on ``background`` and rounded.
-
-    Raises `InputError` as `read_pixels` does.
-    """
+    """Decode a PNG or JPEG to (H, W, 3) RGB, straight alpha composited on ``background`` and rounded."""
     pixels = read_pixels(path)
     if pixels.ndim == 2:
         return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB).astype(np.uint8, copy=False)
@@ -129,6 +126,6 @@ def is_whole(path: Path, width: int, height: int) -> bool:
 def write_image(path: Path, image: ByteArray, *options: int) -> None:
     """Write (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA, 8-bit, atomically; ``options`` are OpenCV's.
 
-    The suffix decides the format. Raises `InputError` as `encode_image` does.
+    The suffix decides the format.
     """
     write_bytes(path, encode_image(image, path.suffix, options, place=path))

@@ -232,14 +232,8 @@ def open_clips(
 ) -> Iterator[CaptureClip]:
     """Read every capture under a folder, one after the other.
 
-    Parameters
-    ----------
-    reader : str
-        See `find_reader`.
-    wishes : Mapping[str, Any] | None
-        Settings such as ``leaks`` that are passed to readers that have them and ignored otherwise.
-    settings : Mapping[str, Any] | None
-        Settings of the reader.
+    ``reader``: See `find_reader`. ``wishes``: Settings such as ``leaks`` that are passed to readers that have them and
+    ignored otherwise. ``settings``: Settings of the reader.
     """
     from ..bench.engine.captures import found_captures  # slow to import
 

@@ -145,10 +145,7 @@ def undistort_clip(clip: CaptureClip, lenses: Mapping[str, Lens]) -> CaptureClip
 
     Each different lens holds a map of 8 bytes per pixel while the clip lives.
 
-    Parameters
-    ----------
-    lenses : Mapping[str, Lens]
-        Lens by camera id; cameras without one have no distortion.
+    ``lenses``: Lens by camera id; cameras without one have no distortion.
     """
     stray = sorted(set(lenses) - set(clip.cameras))
     if stray:
@@ -352,13 +349,7 @@ def find_model(path: str | PathLike[str]) -> tuple[Path, Path] | None:
 
 
 def read_model(path: str | PathLike[str]) -> ColmapModel:
-    """Read cameras and images of the model that `find_model` finds.
-
-    Raises
-    ------
-    InputError
-        There is no model, a file is truncated or damaged, or an image's camera is missing.
-    """
+    """Read cameras and images of the model that `find_model` finds."""
     files = find_model(path)
     if files is None:
         expected = "a COLMAP model: cameras.bin and images.bin, or cameras.txt and images.txt"

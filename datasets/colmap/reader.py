@@ -69,12 +69,8 @@ def model_cameras(
 ) -> dict[str, Camera]:
     """Camera of each image by the image's name, which is also its id.
 
-    Parameters
-    ----------
-    distortion : Literal['refuse', 'left to the images']
-        How to treat distortion, which `Camera` lacks. "refuse" raises if a camera of the model is
-        distorted; "left to the images" gives the cameras of the undistorted images, which
-        `undistort_clip` makes with `model_lenses`.
+    ``distortion``: How to treat distortion, which `Camera` lacks. "refuse" raises if a camera of the model is distorted;
+    "left to the images" gives the cameras of the undistorted images, which `undistort_clip` makes with `model_lenses`.
     """
     lenses = {number: _lens(model, number) for number in model.cameras}
     found: dict[str, Camera] = {}
@@ -306,14 +302,9 @@ def export_model(
     their visible vertices, which get their colours. Images of other timesteps have poses but no points because the
     head has moved.
 
-    Parameters
-    ----------
-    keys : Sequence[FrameKey]
-        Frames to write, at least one; their cameras become the model's.
-    naming : Naming
-        Naming of images, see `image_name`. "flat" is for readers that expect all images in one folder
-        (3D Gaussian splatting and its derivatives); masks are then also written under the image's own
-        name.
+    ``keys``: Frames to write, at least one; their cameras become the model's. ``naming``: Naming of images, see
+    `image_name`. "flat" is for readers that expect all images in one folder (3D Gaussian splatting and its derivatives);
+    masks are then also written under the image's own name.
     """
     if not keys:
         raise InputError("frames to export", "", "at least one", "none")

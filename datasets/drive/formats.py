@@ -81,10 +81,7 @@ def read_flame_parameters(request: SignalRequest) -> DrivingSignal:
 
 
 def read_capture_signal(request: SignalRequest) -> DrivingSignal:
-    """Poses of one sequence of a capture of any layout, without excluded frames, in the order of time.
-
-    Raises `InputError` for an unknown sequence, and for none where the capture has several.
-    """
+    """Poses of one sequence of a capture of any layout, without excluded frames, in the order of time."""
     head = request.signal_head if request.signal_head != AVATAR else ""
     if head and not Path(head).exists():
         expected = "the file of a head model, for a signal that is a capture"
@@ -172,11 +169,7 @@ _COMPONENT = re.compile(r"([a-z]+)\.(\d+)")
 
 
 def read_mapped(request: SignalRequest) -> DrivingSignal:
-    """Poses of a table by the map file of the request, ``{column: {coefficient: weight}}``.
-
-    Raises `InputError` for a map with a column that the table lacks, with an unknown coefficient, or with ARKit's names beside
-    coefficients, which are of another head.
-    """
+    """Poses of a table by the map file of the request, ``{column: {coefficient: weight}}``."""
     table, source = request.columns, Path(request.map)
     content = {str(name): entry for name, entry in read_yaml(source).items()}
     weights = checked(content, dict[str, dict[str, float]], source)

@@ -65,16 +65,13 @@ class SignalRequest:
 
     @property
     def columns(self) -> SignalTable:
-        """The table. Raises `InputError` if the signal is not a table."""
+        """The table."""
         if self.table is None:
             raise InputError(self.path, "", "a table of numbers, or files of each frame", "a capture")
         return self.table
 
     def head(self, default: str = "") -> HeadArrays:
-        """Head model of the signal's coefficients: the one given, or the avatar's if that is ``default`` ("" for any).
-
-        Raises `InputError` if it is not given and has to be.
-        """
+        """Head model of the signal's coefficients: the one given, or the avatar's if that is ``default`` ("" for any)."""
         if self.signal_head and self.signal_head != AVATAR:
             return _loaded(self.signal_head)
         if self.signal_head == AVATAR or default in ("", self.target.version):
@@ -94,8 +91,6 @@ def make_poses(path: Path, head: HeadArrays, parts: Mapping[str, FloatArray]) ->
     """Poses of (T, n) arrays by name: expression, eyelids and those of `POSE_PARTS`; missing ones are 0.
 
     Fewer expression coefficients than the head model has are padded with zeros; eyelids are left out if it has no basis.
-
-    Raises `InputError` for a wrong size, more coefficients than the head model has, and expressions beyond a head's size.
     """
     length = len(next(iter(parts.values())))
     size = head.expression_basis.shape[2]
@@ -202,7 +197,7 @@ def is_blendshapes(table: SignalTable) -> bool:
 
 
 def read_blendshapes(request: SignalRequest) -> DrivingSignal:
-    """Blendshapes of each frame with a face. Raises `InputError` for a misspelt column, and for values beyond `RANGE`."""
+    """Blendshapes of each frame with a face."""
     known = {name: arkit_name(name) for name in request.columns.columns}
     table = request.columns.with_face([name for name, arkit in known.items() if arkit])
     unused = {}
@@ -235,10 +230,7 @@ def apply_blendshapes(
 ) -> DrivingSignal:
     """Poses of the head that performs the blendshapes: the one given, else the embedded one.
 
-    Parameters
-    ----------
-    channels : Mapping[str, FloatArray]
-        (T,) values by ARKit's name.
+    ``channels``: (T,) values by ARKit's name.
     """
     if request.signal_head:
         head = request.head()
@@ -269,10 +261,7 @@ def is_embedded(head: HeadArrays) -> bool:
 
 
 def blendshape_parts(head: HeadArrays) -> dict[str, dict[str, FloatArray]]:
-    """Effect of each blendshape at 1 on the parts of a pose, by name: expression (E,), jaw (3,), eyes (6,), eyelids (2,).
-
-    Raises `InputError` for a head without shapes of ARKit's names other than the embedded one.
-    """
+    """Effect of each blendshape at 1 on the parts of a pose, by name: expression (E,), jaw (3,), eyes (6,), eyelids (2,)."""
     found: dict[str, dict[str, FloatArray]] = {name: _joint(weights) for name, weights in JOINTS.items()}
     if is_embedded(head):
         return found | _embedded_parts(head.version)

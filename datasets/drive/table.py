@@ -134,7 +134,7 @@ class SignalTable:
         return values
 
     def single(self, name: str) -> FloatArray:
-        """(T,) values of a column with one number a frame. Raises `InputError` for more, and as `values`."""
+        """(T,) values of a column with one number a frame."""
         found = self.values(name)
         if found.shape[1] != 1:
             raise InputError(self.path, name, "one number a frame", str(found.shape[1]))
@@ -165,8 +165,6 @@ def read_table(path: Path, fps: float | None = None) -> SignalTable:
     """Read a file by its ending, or a folder with files of each frame. Times are those of a column, if there are any.
 
     With ``fps``, frames per second, a column of times that gives no rate is no error.
-
-    Raises `InputError` for another ending, a damaged or empty file, and frames with unequal columns.
     """
     read = _folder if path.is_dir() else _READERS.get(path.suffix.lower())
     if read is None:
@@ -197,10 +195,7 @@ def _without_nan(text: str) -> str:
 
 
 def _expanded(frame: Mapping[str, Any], path: Path, place: str, names: Sequence[str] = ()) -> dict[str, Any]:
-    """Columns of a frame, also of objects in it, with one for each of MediaPipe's categories or of the ``names`` of weights.
-
-    Raises `InputError` for two faces.
-    """
+    """Columns of a frame, also of objects in it, with one for each of MediaPipe's categories or of the ``names`` of weights."""
     line: dict[str, Any] = {}
     for name, value in frame.items():
         faces = value if isinstance(value, list) else [value]
@@ -222,7 +217,7 @@ def _expanded(frame: Mapping[str, Any], path: Path, place: str, names: Sequence[
 
 
 def _weights(row: Any, path: Path, place: str, names: Sequence[str]) -> dict[str, Any]:
-    """Values by name of a row of weights; none of an empty row. Raises `InputError` for another number of them."""
+    """Values by name of a row of weights; none of an empty row."""
     if not is_empty(row) and not (isinstance(row, list) and len(row) == len(names)):
         found = str(len(row)) if isinstance(row, list) else shown(row)
         raise InputError(path, place, f"{len(names)} values a row, as there are names", found)
@@ -307,7 +302,7 @@ def _named(document: Mapping[str, Any], keys: Sequence[str], kind: type) -> Any:
 
 
 def _rate(path: Path, document: Mapping[str, Any]) -> float | None:
-    """Frames per second that a document states. Raises `InputError` for none from 1 to `MOST_FPS`."""
+    """Frames per second that a document states."""
     for key, value in document.items():
         value = value[0] if isinstance(value, list) and len(value) == 1 else value
         if key.lower().replace("_", "") in _RATES and not is_empty(value) and not isinstance(value, list):

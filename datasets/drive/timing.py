@@ -89,8 +89,7 @@ def natural_order(path: Path) -> list[tuple[bool, int | str]]:
 def in_order(paths: Sequence[Path]) -> tuple[list[Path], Timing]:
     """Files or folders of one frame each by the number of the frame in their names, and their times.
 
-    The frame's is the first number that varies; some or all names may have a second, such as a face's. Raises `InputError` for
-    two of one frame.
+    The frame's is the first number that varies; some or all names may have a second, such as a face's.
     """
     paths = sorted(paths, key=natural_order)
     numbers = [[int(part) for part in re.findall(r"\d+", path.stem)] for path in paths]
@@ -120,10 +119,7 @@ def is_empty(value: Any) -> bool:
 def from_columns(
     path: Path, columns: Mapping[str, Any], places: Sequence[str], has_rate: bool
 ) -> Timing | None:
-    """Times by a column of times, or of frame numbers; None without one. Times without a value are interpolated.
-
-    Raises `InputError` for times that do not increase, and for those that give no usual rate unless another is known.
-    """
+    """Times by a column of times, or of frame numbers; None without one. Times without a value are interpolated."""
     found: tuple[str, list[int], FloatArray] | None = None
     unread = ""
     for pattern, parsed in ((_TIME, _seconds), (_NUMBER, _numbers)):

@@ -52,10 +52,7 @@ def transfer(
 ) -> Transferred:
     """Bring a signal to a head model by `refit`, on the vertices of the signal's mean head, so that no identity is transferred.
 
-    Parameters
-    ----------
-    neutral : int | None
-        Frame of the signal with the neutral face; None takes the neutral face of the signal's head model.
+    ``neutral``: Frame of the signal with the neutral face; None takes the neutral face of the signal's head model.
     """
     poses = list(signal.poses)
     if neutral is not None and neutral >= len(poses):
@@ -84,10 +81,7 @@ def transfer(
 class FrameTransfer:
     """`transfer` frame by frame, for live signals.
 
-    Parameters
-    ----------
-    source, target : HeadArrays
-        Head models of the signal and of the avatar.
+    ``source``, ``target``: Head models of the signal and of the avatar.
     """
 
     def __init__(self, source: HeadArrays, target: HeadArrays):
@@ -166,8 +160,8 @@ def resampled(
 ) -> tuple[list[HeadPose], list[tuple[int, int]]]:
     """Poses at ``fps``, and the first and last number of each series of them that no frame of the signal is near to.
 
-    Between two frames poses are interpolated linearly, head rotations on the shortest path; before the first and after the last
-    they are held. Signals that state no rate have ``fps``. Raises `InputError` for a signal without half of its frames.
+    Between two frames poses are interpolated linearly, head rotations on the shortest path; before the first and after the
+    last they are held. Signals that state no rate have ``fps``.
     """
     positions, total = timing.positions, round(timing.last) + 1
     if 2 * len(positions) < total:
@@ -203,10 +197,7 @@ def resampled(
 
 
 def window_length(frames: int, seconds: float, fps: float) -> int:
-    """Odd number of frames of a window of ``seconds``; 0 for no window.
-
-    Raises `InputError` for a window that is too short to smooth, or longer than the signal.
-    """
+    """Odd number of frames of a window of ``seconds``; 0 for no window."""
     if not seconds:
         return 0
     window = 2 * round((seconds * fps - 1) / 2) + 1
@@ -222,8 +213,6 @@ def smoothed(poses: Sequence[HeadPose], seconds: float, fps: float) -> list[Head
 
     Savitzky and Golay, "Smoothing and differentiation of data by simplified least squares procedures", Anal. Chem. 36, 1964,
     by `scipy.signal.savgol_filter`. The window has the odd number of frames nearest to ``seconds``.
-
-    Raises `InputError` as `window_length`.
     """
     if not seconds:
         return list(poses)
@@ -254,12 +243,7 @@ def _eyelids(pose: HeadPose, target: HeadArrays) -> FloatArray | None:
 class LiveDriver:
     """Converts lines of one frame each (coefficients or blendshapes, as for `read_signal`) to poses of a head model.
 
-    Parameters
-    ----------
-    target : HeadAsset
-        Head model of the avatar.
-    signal_head : str
-        See `settings.DriveSettings`.
+    ``target``: Head model of the avatar. ``signal_head``: See `settings.DriveSettings`.
     """
 
     def __init__(self, target: HeadAsset, signal_head: str = ""):
@@ -276,10 +260,7 @@ class LiveDriver:
         self._first: RigidMean | None = None
 
     def __call__(self, line: str) -> HeadPose:
-        """The pose of a line; the head moves around the origin, relative to the first line.
-
-        Raises `InputError` for a line that is not a frame of a known format.
-        """
+        """The pose of a line; the head moves around the origin, relative to the first line."""
         path = Path("live signal")
         frame = parse_line(line, path, "line")
         if not frame:

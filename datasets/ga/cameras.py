@@ -67,11 +67,7 @@ class CaptureCameras:
 
 
 def collect_cameras(entries: Sequence[FrameEntry], infos: Mapping[Path, ImageInfo]) -> CaptureCameras:
-    """Gather the cameras of all frames.
-
-    Raises `InputError` if a camera moves or changes within a sequence, sequences differ by more than a translation, or
-    ``camera_index`` and ``camera_id`` do not match.
-    """
+    """Gather the cameras of all frames."""
     _check_ids(entries)
     sizes = {entry.image: (infos[entry.image].width, infos[entry.image].height) for entry in entries}
     groups: dict[str, dict[str, FrameEntry]] = {}

@@ -64,7 +64,7 @@ class Stamp(NamedTuple):
 
 
 def digest_content(path: Path) -> str:
-    """Hex SHA-256 of a file's content. Raises `InputError` for damaged JSON and npz."""
+    """Hex SHA-256 of a file's content."""
     if path.suffix == ".json":
         value = read_json(path)
         with reading(path, "JSON of usual depth"):
@@ -130,12 +130,9 @@ def content_digests(
 ) -> dict[Path, str]:
     """`digest_content` of each file.
 
-    Parameters
-    ----------
-    cached_for : Path | None
-        The capture that the files belong to. Digests of files with an unchanged `Stamp` are taken
-        from the user's cache (``digests`` of `cache_folder`, never the capture itself), and new
-        digests are stored there. None reads every byte.
+    ``cached_for``: The capture that the files belong to. Digests of files with an unchanged `Stamp` are taken from the
+    user's cache (``digests`` of `cache_folder`, never the capture itself), and new digests are stored there. None reads
+    every byte.
     """
     paths = sorted(set(files))
     place = _place(cached_for) if cached_for else None
@@ -220,10 +217,7 @@ def check_images(
 ) -> dict[Path, ImageInfo]:
     """Check that every image and mask exists, is complete, and has the size declared by its frame.
 
-    Parameters
-    ----------
-    decode : bool
-        Whether to decode every file, which finds damage in the middle (minutes for a large capture).
+    ``decode``: Whether to decode every file, which finds damage in the middle (minutes for a large capture).
 
     Returns
     -------
@@ -365,10 +359,7 @@ def split_by_holding_out(
     All frames of the held-out sequences are self-reenactment, the held-out cameras' other frames are novel
     view, and the rest is training.
 
-    Parameters
-    ----------
-    sequences : Sequence[str]
-        Full names or unique prefixes.
+    ``sequences``: Full names or unique prefixes.
     """
     keys = sorted(set(keys))
     available = sorted({key.sequence for key in keys})
@@ -397,10 +388,7 @@ def _match(file: Path, wanted: str, available: Sequence[str]) -> str:
 def require_full_grid(clip: CaptureClip, source: str | Path = "") -> None:
     """Check that every camera has a frame at every timestep; excluded frames count as existing.
 
-    Parameters
-    ----------
-    source : str | Path
-        The capture that the clip was read from, for the message.
+    ``source``: The capture that the clip was read from, for the message.
     """
     timesteps = sorted({(key.sequence, key.timestep) for key in clip.files})
     wanted = (

@@ -269,10 +269,7 @@ class CaptureWriter:
         write_image(self.image_path(sequence, timestep, camera), image)
 
     def write_metadata(self) -> Path:
-        """Write parameters, JSONs and the head model; return the union folder.
-
-        Raises `InputError` with the first image that is missing, damaged or of the wrong size.
-        """
+        """Write parameters, JSONs and the head model; return the union folder."""
         plan = self.plan
         for sequence in plan.sequences:
             for timestep in range(len(sequence.poses)):

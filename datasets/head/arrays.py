@@ -87,10 +87,7 @@ class HeadArrays:
     def validate(self, file: str | PathLike[str]) -> HeadArrays:
         """Validate the model and return self.
 
-        Parameters
-        ----------
-        file : str | PathLike[str]
-            Source of the arrays, named in the error.
+        ``file``: Source of the arrays, named in the error.
         """
         arrays = {name: np.asarray(getattr(self, name)) for name in STORED} | self._optional()
         sizes = {"J": len(JOINT_NAMES), "9 (J - 1)": 9 * (len(JOINT_NAMES) - 1)}
@@ -119,12 +116,8 @@ class HeadArrays:
     ) -> FloatArray:
         """Vertices (V, 3) in a pose, metres, float64.
 
-        Parameters
-        ----------
-        shape : FloatArray | None
-            (S,) identity coefficients; None for the mean head.
-        static_offset : FloatArray | None
-            (V, 3) metres, added to the shaped template.
+        ``shape``: (S,) identity coefficients; None for the mean head. ``static_offset``: (V, 3) metres, added to the shaped
+        template.
         """
         from .model import PosedSubject  # with torch
 
@@ -268,7 +261,7 @@ def with_derived_regions(head: HeadArrays) -> HeadArrays:
 
 
 def region(head: HeadAsset, name: str) -> IntArray:
-    """Vertices of a region. Raises `InputError` if the region does not exist or is empty."""
+    """Vertices of a region."""
     if not len(head.regions.get(name, ())):
         known = ", ".join(sorted(head.regions)) or "none"
         remedy = "For a FLAME pickle, give FLAME_masks.pkl as masks=."

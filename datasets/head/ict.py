@@ -146,13 +146,8 @@ def expression_names(content: Mapping[str, np.ndarray]) -> tuple[str, ...]:
 def ict_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> HeadArrays:
     """Rig the kit: metres, +y up, +z front, origin amid the head.
 
-    Parameters
-    ----------
-    file : str | PathLike[str]
-        Named in errors.
-    content : Mapping[str, np.ndarray]
-        Members of the npz: ``v_neutral`` and deltas in centimetres, triangles with materials, names,
-        landmark vertices.
+    ``file``: Named in errors. ``content``: Members of the npz: ``v_neutral`` and deltas in centimetres, triangles with
+    materials, names, landmark vertices.
 
     Returns
     -------
@@ -317,12 +312,8 @@ def mesh_parts(
 ) -> Parts:
     """Split the mesh: sorted vertex indices by part.
 
-    Parameters
-    ----------
-    materials : Mapping[str, IntArray]
-        Vertices of each material's triangles.
-    jaw_open : FloatArray
-        (V, 3) displacement of ``jawOpen``, which separates lower teeth from upper teeth.
+    ``materials``: Vertices of each material's triangles. ``jaw_open``: (V, 3) displacement of ``jawOpen``, which separates
+    lower teeth from upper teeth.
     """
     for name in _MATERIALS:
         if name not in materials or not len(materials[name]):

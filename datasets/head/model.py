@@ -27,12 +27,8 @@ class HeadModel(torch.nn.Module):
     Every argument is ``(B, n)`` or ``(n,)``, and arguments of batch size 1 are broadcast. Lengths are metres,
     rotations axis-angle in radians.
 
-    Parameters
-    ----------
-    asset : HeadAsset
-        Head in FLAME's layout, e.g. `HeadArrays`.
-    dtype, device : torch.dtype, torch.device | str
-        Type and device of the buffers; inputs must match.
+    ``asset``: Head in FLAME's layout, e.g. `HeadArrays`. ``dtype``, ``device``: Type and device of the buffers; inputs must
+    match.
     """
 
     template: Tensor
@@ -191,8 +187,7 @@ class HeadModel(torch.nn.Module):
     def pose_arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
         """Poses as arguments of `forward`, with this model's dtype and device.
 
-        ``eyelids`` is included only if the model has eyelid bases (zeros for poses without them). Raises as
-        `pose_columns`.
+        ``eyelids`` is included only if the model has eyelid bases (zeros for poses without them).
         """
         columns = self.pose_columns(poses)
         # One array, so that one copy takes it to a device.
@@ -261,14 +256,8 @@ def joint_motions(rotations: Tensor, joints: Tensor, parents: Sequence[int]) -> 
     With local rotation Q_j and parent p: R_j = R_p Q_j and o_j = o_p + (R_p - R_j) c_j for a joint with rest position
     c_j.
 
-    Parameters
-    ----------
-    rotations : Tensor
-        (B, J, 3, 3) local rotation of each joint relative to its parent.
-    joints : Tensor
-        (B, J, 3) rest positions; the root does not move.
-    parents : Sequence[int]
-        Parent of each joint, -1 for the root; parents come first.
+    ``rotations``: (B, J, 3, 3) local rotation of each joint relative to its parent. ``joints``: (B, J, 3) rest positions;
+    the root does not move. ``parents``: Parent of each joint, -1 for the root; parents come first.
 
     Returns
     -------
@@ -304,12 +293,7 @@ BATCH = 64
 class PosedSubject:
     """One identity of a head model.
 
-    Parameters
-    ----------
-    shape : FloatArray
-        (S,) identity coefficients.
-    static_offset : FloatArray
-        (V, 3) metres.
+    ``shape``: (S,) identity coefficients. ``static_offset``: (V, 3) metres.
     """
 
     def __init__(
@@ -335,7 +319,7 @@ class PosedSubject:
         return cls(clip.head, clip.shape, clip.static_offset, dtype)
 
     def meshes(self, poses: Sequence[HeadPose]) -> FloatArray:
-        """(T, V, 3) vertices in the world, metres. Raises `InputError` for poses of another model."""
+        """(T, V, 3) vertices in the world, metres."""
         return np.concatenate([*self.batches(poses)])
 
     def batches(self, poses: Sequence[HeadPose], size: int = BATCH) -> Iterator[FloatArray]:
@@ -352,10 +336,7 @@ class PosedSubject:
         return zip(timesteps, chain.from_iterable(self.batches(poses, size)))
 
     def motions(self, poses: Sequence[HeadPose]) -> FloatArray:
-        """(T, 4, 4) rigid motion of the head, from the frame with the neck joint at rest to the world, metres.
-
-        Raises `InputError` for poses of another model.
-        """
+        """(T, 4, 4) rigid motion of the head, from the frame with the neck joint at rest to the world, metres."""
 
         moving = ("expression", "rotation", "neck", "translation")
         return np.concatenate(

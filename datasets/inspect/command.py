@@ -51,11 +51,7 @@ JAW_PICTURE, CLUSTER_PICTURE = "jaw_bases.png", "expression_clusters.png"
 
 @command("inspect steps", group="inspect", writes="out")
 def steps(settings: StepsSettings, progress: Progress = no_progress) -> CommandResult:
-    """Plot the jaw bases and expression clusters of a capture's training frames.
-
-    Raises `InputError` for a capture that the reader refuses, for counts below 1, and for a head without a face
-    region.
-    """
+    """Plot the jaw bases and expression clusters of a capture's training frames."""
     from ..images import write_image
     from ..steps.clusters import cluster_expressions
     from ..steps.figures import draw_clusters, draw_jaw_bases, find_jaw_bases
@@ -114,11 +110,7 @@ PICTURE, NUMBERS = "inspection.png", "inspection.json"
 
 @command("inspect", group="inspect", writes="out")
 def inspect(settings: InspectSettings, progress: Progress = no_progress) -> CommandResult:
-    """Plot a capture: camera rig, splits, tracked mesh over images, motion.
-
-    Raises `InputError` for a capture that the reader refuses (``headbench lint`` reports all faults),
-    for a clip without training frames that are not excluded, and for counts below 1.
-    """
+    """Plot a capture: camera rig, splits, tracked mesh over images, motion."""
     from ..images import write_image
     from .figure import draw_figure
     from .statistics import expression_space, sequence_rows, split_rows

@@ -75,7 +75,7 @@ class Track:
 
 
 def ordered(root: Path, frames: Sequence[VideoFrame]) -> list[VideoFrame]:
-    """Frames by name. Raises `InputError` if there are none, or two with the same name."""
+    """Frames by name."""
     if not frames:
         raise InputError(root, "frames", "at least one frame", "none")
     found: dict[tuple[str, int], VideoFrame] = {}
@@ -91,7 +91,7 @@ def ordered(root: Path, frames: Sequence[VideoFrame]) -> list[VideoFrame]:
 
 
 def frame_number(file: Path, entry: str, stem: str) -> int:
-    """Number in the names of a frame's files. Raises `InputError` for a name without one."""
+    """Number in the names of a frame's files."""
     if not (stem.isascii() and stem.isdecimal() and len(stem) < 10):
         raise InputError(file, entry, "files named by the frame's number, such as 00012", repr(stem)[:60])
     return int(stem)
@@ -104,8 +104,6 @@ def fix_camera(
 
     With W the camera of a frame and W0 the first, the head moves by M = W0^-1 W: its global rotation becomes R_M R, and
     since that turns about joint 0 at J (which moves with the expression) its translation R_M (J + t) + t_M - J.
-
-    Raises `InputError` if frames differ in image size or intrinsics.
     """
     first = frames[0].camera
     for frame in frames:
@@ -144,10 +142,7 @@ def fix_camera(
 
 
 def coefficients(file: Path, entry: str, values: FloatArray, size: int) -> FloatArray:
-    """Coefficients as a vector of ``size``: padded with zeros, or truncated if the remainder is zero.
-
-    Raises `InputError` if the head model lacks a used direction.
-    """
+    """Coefficients as a vector of ``size``: padded with zeros, or truncated if the remainder is zero."""
     if np.any(values[size:]):
         expected = f"at most {size} coefficients, which the head model has, or zeros behind them"
         remedy = "Give the head model the video was tracked with."
@@ -157,10 +152,7 @@ def coefficients(file: Path, entry: str, values: FloatArray, size: int) -> Float
 
 
 def rotations_of_6d(file: Path, entry: str, rows: FloatArray) -> FloatArray:
-    """(N, 3) axis-angle of (N, 6) rotations that are the first two rows of a matrix, made orthonormal in order.
-
-    Raises `InputError` for two vectors of one direction.
-    """
+    """(N, 3) axis-angle of (N, 6) rotations that are the first two rows of a matrix, made orthonormal in order."""
     first, second = rows[:, :3], rows[:, 3:]
     normal = np.cross(first, second)
     if np.linalg.norm(normal, axis=1).min() < 1e-6:
@@ -213,16 +205,9 @@ def clip_of_track(
 ) -> CaptureClip:
     """The clip of a tracked video.
 
-    Parameters
-    ----------
-    root : Path
-        The folder that paths are relative to, for messages and digests.
-    head : HeadArrays
-        Head model of the track.
-    subject, teeth, background, held_out_frames, held_out_sequences, cache_mb, use_cache : Any
-        As for `reader.read_video`.
-    files : Collection[Path]
-        Files besides those of the track that the clip depends on.
+    ``root``: The folder that paths are relative to, for messages and digests. ``head``: Head model of the track.
+    ``subject``, ``teeth``, ``background``, ``held_out_frames``, ``held_out_sequences``, ``cache_mb``, ``use_cache``: As for
+    `reader.read_video`. ``files``: Files besides those of the track that the clip depends on.
     """
     for frame in track.frames:
         check_name(frame.sequence, root, "video")

@@ -75,7 +75,7 @@ def _lists_frames(path: Path) -> bool:
 
 
 def read_imavatar(root: Path, head: HeadArrays, progress: Progress) -> Track:
-    """Read all videos of a subject. Raises `InputError` for missing data and data that do not fit the head model."""
+    """Read all videos of a subject."""
     folders = videos(root)
     frames: list[VideoFrame] = []
     shape: FloatArray | None = None

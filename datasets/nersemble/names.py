@@ -187,7 +187,7 @@ def union10_held_out(subject: str) -> str:
 def chosen_subjects(text: str) -> list[str]:
     """Subject ids of an option: ids separated by commas, ``paper`` (the nine) or ``ablation``.
 
-    Numbers are padded to three digits, so 74 is 074. Raises `InputError` for anything else and for subjects named twice.
+    Numbers are padded to three digits, so 74 is 074.
     """
     if text in SUBJECT_NAMES:
         return [*SUBJECT_NAMES[text]]

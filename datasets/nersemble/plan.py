@@ -109,7 +109,7 @@ class PreparationPlan:
 
 
 def plan_subject(settings: PrepareSettings, subject: str) -> PreparationPlan:
-    """Read everything about one subject except its pixels. Raises `InputError` for the first fault."""
+    """Read everything about one subject except its pixels."""
     one = participant(Path(settings.root), subject)
     out = Path(os.path.abspath(settings.out))
     calibration = read_calibration(one.calibration_file)

@@ -64,7 +64,7 @@ class Participant:
     colour_folder: Path | None = None
 
     def match(self, wanted: str) -> str:
-        """Full name of a sequence given by name or unique prefix. Raises `InputError` where none is there."""
+        """Full name of a sequence given by name or unique prefix."""
         try:
             return match_sequence(self.calibration_file, wanted, self.sequences)
         except InputError as error:
@@ -75,10 +75,7 @@ class Participant:
             raise InputError(error.file, error.key, error.expected, error.found, remedy) from None
 
     def corrections(self, sequence: str, serials: Iterable[str]) -> dict[str, Correction]:
-        """Colour correction by serial; empty if the recording has no colour calibration.
-
-        Raises `InputError` if there is one, but not for all of ``serials``.
-        """
+        """Colour correction by serial; empty if the recording has no colour calibration."""
         if self.colour_file is not None:
             entries = read_json(self.colour_file)
             return {s: polynomial_correction(self.colour_file, s, entries.get(s)) for s in serials}
@@ -93,7 +90,7 @@ class Participant:
 
 
 def participants(root: Path) -> dict[str, Participant]:
-    """Participants under ``root`` by id. Raises `InputError` if there are none."""
+    """Participants under ``root`` by id."""
     if not root.is_dir():
         raise InputError(root, "", "a folder with recordings", "a file" if root.exists() else "nothing")
     listed = _listed_sequences(root)
@@ -109,7 +106,7 @@ def participants(root: Path) -> dict[str, Participant]:
 
 
 def participant(root: Path, subject: str) -> Participant:
-    """One participant, with calibration. Raises `InputError` if the recording lacks either."""
+    """One participant, with calibration."""
     known = participants(root)
     if subject not in known:
         raise InputError(root, "subject", f"one out of {', '.join(known)}", subject)
@@ -188,8 +185,7 @@ class Calibration:
     def camera(self, serial: str, size: tuple[int, int], output: tuple[int, int]) -> Camera:
         """Camera for images of ``output`` size made of images of ``size``, both (width, height).
 
-        Pixels scale with the edges of the image: no half-pixel term. Raises `InputError` where the images
-        have another shape than the calibration refers to.
+        Pixels scale with the edges of the image: no half-pixel term.
         """
         width, height = self.size or size
         if abs(size[0] * height - size[1] * width) > max(width, height):
@@ -231,7 +227,7 @@ def _gram_schmidt(matrix: FloatArray) -> FloatArray | None:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read and check ``camera_params.json``. Raises `InputError` for the first fault."""
+    """Read and check ``camera_params.json``."""
     value = read_json(path)
     matrices = value.get("world_2_cam")
     if not isinstance(matrices, dict) or not matrices:

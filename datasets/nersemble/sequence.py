@@ -104,19 +104,10 @@ def read_sequence(
 ) -> RecordedSequence:
     """Inspect a sequence and check that it is complete.
 
-    Parameters
-    ----------
-    wanted : str
-        Its name or a unique prefix.
-    cameras : Sequence[str]
-        Serials; empty for all cameras of the calibration.
-    every : int | None
-        Frame stride: keep the frames whose number it divides. None keeps every third frame of videos
-        and of the 2023 frame folders, which have 73 frames per second, and all images of VHAP's
-        preprocessing (25 per second).
-    cut : bool
-        Whether to keep only the frames that all cameras have if they differ, instead of raising an
-        error.
+    ``wanted``: Its name or a unique prefix. ``cameras``: Serials; empty for all cameras of the calibration. ``every``:
+    Frame stride: keep the frames whose number it divides. None keeps every third frame of videos and of the 2023 frame
+    folders, which have 73 frames per second, and all images of VHAP's preprocessing (25 per second). ``cut``: Whether to
+    keep only the frames that all cameras have if they differ, instead of raising an error.
     """
     name = participant.match(wanted)
     folder = participant.sequences[name]
@@ -255,7 +246,7 @@ def probe_video(path: Path) -> tuple[int, tuple[int, int]]:
 
 
 def open_video(path: Path) -> cv2.VideoCapture:
-    """Open a video on one decoding thread, since streams run in parallel. Raises `InputError` on failure.
+    """Open a video on one decoding thread, since streams run in parallel.
 
     Pixels are read as stored, without the rotation in the file's metadata.
     """

@@ -215,9 +215,6 @@ def read_tracked(
 
     ``kept`` is whether each frame before a cut is among the ``timesteps``; parameters of all frames are cut
     accordingly.
-
-    Raises `InputError` for a file of another tracker, missing arrays, wrong shapes, numbers that are not finite or beyond
-    `MAX_MAGNITUDE`, a number of timesteps other than ``timesteps``, and coefficients that the head model has no basis for.
     """
     arrays = read_npz(path)
     if "rotation_matrices" in arrays:
@@ -244,8 +241,7 @@ def find_tracked(root: Path, subject: str, sequence: str) -> Path | None:
     """Final parameters of a sequence under VHAP's output folder; None if there are none.
 
     Looks in folders named as VHAP's scripts name them (``074_EMO-1_v16_DS4_wBg_staticOffset``) or plainly
-    ``074_EMO-1-shout+laugh``, uses the latest dated run inside, and its last epoch. Raises `InputError` if two folders
-    fit.
+    ``074_EMO-1-shout+laugh``, uses the latest dated run inside, and its last epoch.
     """
     folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
     fitting = []

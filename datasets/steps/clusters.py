@@ -59,14 +59,8 @@ def farthest_quaternions(
 ) -> FloatArray:
     """Greedy farthest-point sampling by 1 - |<p, q>|, starting with ``seed``.
 
-    Parameters
-    ----------
-    candidates : FloatArray
-        (N, 4) unit quaternions, real part first.
-    seed : Sequence[float]
-        (4,) the first choice, included in ``count``.
-    tolerance : float
-        Stop when no candidate is farther than this from the chosen ones.
+    ``candidates``: (N, 4) unit quaternions, real part first. ``seed``: (4,) the first choice, included in ``count``.
+    ``tolerance``: Stop when no candidate is farther than this from the chosen ones.
 
     Returns
     -------
@@ -89,12 +83,8 @@ def jaw_bases(
     There are fewer than ``count`` if the performance has fewer jaw rotations that differ by more than
     `DISTINCT_ANGLE`.
 
-    Parameters
-    ----------
-    variant : Literal['paper', 'official']
-        "official" reproduces the published code: candidates are the poses of all novel-view frames
-        and of every 16th self-reenactment frame (**a leak of the test signal**), seeded with
-        `HALF_TURN`.
+    ``variant``: "official" reproduces the published code: candidates are the poses of all novel-view frames and of every
+    16th self-reenactment frame (**a leak of the test signal**), seeded with `HALF_TURN`.
     """
     if variant == "official":
         test = sorted(clip.splits["self_reenactment"], key=lambda key: (key.timestep, key.camera))
@@ -114,12 +104,7 @@ def jaw_weights(quaternions: FloatArray, bases: FloatArray) -> FloatArray:
     They hardly depend on the pose: the cosine of half an angle a is 1 - a^2 / 8, so for angles up to 0.2 rad from the bases all
     weights lie within 0.5 % of 1 / n.
 
-    Parameters
-    ----------
-    quaternions : FloatArray
-        (N, 4) unit quaternions, real part first.
-    bases : FloatArray
-        (n, 4) output of `jaw_bases`.
+    ``quaternions``: (N, 4) unit quaternions, real part first. ``bases``: (n, 4) output of `jaw_bases`.
     """
     likeness = np.abs(quaternions @ bases.T)
     return likeness / likeness.sum(axis=1, keepdims=True)
@@ -184,14 +169,9 @@ def cluster_expressions(
     Nyström method is used (see `spectral`); memory then grows with T times ``limit`` and T times the size of a face,
     never with T squared. There are never more classes than distinct faces (landmarks, beyond ``limit``).
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the first landmark, or of the random starts of "official"; unused for all pairs
-        otherwise.
-    variant : Literal['paper', 'official']
-        "official" reproduces the published code: all pairs regardless of their number, k-means from
-        ten random starts. Both use training timesteps only.
+    ``seed``: Seed of the first landmark, or of the random starts of "official"; unused for all pairs otherwise.
+    ``variant``: "official" reproduces the published code: all pairs regardless of their number, k-means from ten random
+    starts. Both use training timesteps only.
     """
     timesteps = np.array(sorted({key.timestep for key in clip.splits["train"]}))
     faces = expression_displacements(clip, timesteps.tolist())
@@ -217,15 +197,9 @@ def cluster_by_distance(
 ) -> tuple[IntArray, FloatArray]:
     """Spectral clustering with the similarity 1 - d / max d, from all pairs or only from distances to landmarks.
 
-    Parameters
-    ----------
-    distances : FloatArray
-        (N, N) symmetric, zero diagonal; or (N, m) of each item to each landmark. If the landmarks are
-        farthest points, the largest of these is the largest of all, up to the landmarks' radius.
-    classes : int
-        Maximum number of classes; fewer if there are fewer distinct items.
-    landmarks : IntArray | None
-        (m,) distinct indices of the landmarks.
+    ``distances``: (N, N) symmetric, zero diagonal; or (N, m) of each item to each landmark. If the landmarks are farthest
+    points, the largest of these is the largest of all, up to the landmarks' radius. ``classes``: Maximum number of classes;
+    fewer if there are fewer distinct items. ``landmarks``: (m,) distinct indices of the landmarks.
 
     Returns
     -------
@@ -283,7 +257,7 @@ def expression_displacements(clip: Clip, timesteps: Sequence[int]) -> FloatArray
     """(T, 3, F) float32 displacements of the face's F vertices from the neutral face, metres.
 
     Meshes have jaw, eyes and expression, but no rotation, neck and translation; vertices of the eye region have weight
-    `EYE_WEIGHT`. Raises `InputError` if the head has no region "face".
+    `EYE_WEIGHT`.
     """
     vertices, weights = _face_vertices(clip.head)
     subject = PosedSubject.of(clip, torch.float32)
@@ -321,14 +295,8 @@ def farthest_meshes(
     By the triangle inequality the distance of any two meshes differs from that of their landmarks by the sum of
     their distances to these, at most twice the radius. Memory grows with N times ``limit``, never with N squared.
 
-    Parameters
-    ----------
-    meshes : FloatArray
-        (N, 3, F) float32, N at least 1.
-    limit : int
-        Maximum number of landmarks.
-    tolerance : float
-        Stop when the radius is at most this fraction of the largest distance found.
+    ``meshes``: (N, 3, F) float32, N at least 1. ``limit``: Maximum number of landmarks. ``tolerance``: Stop when the radius
+    is at most this fraction of the largest distance found.
     """
     count = min(limit, len(meshes))
     columns = np.empty((count, len(meshes)), dtype=np.float32)
@@ -401,12 +369,8 @@ def nystrom_embedding(columns: FloatArray, landmarks: IntArray, classes: int) ->
     not be positive). Its diagonal is removed as that of the exact matrix is, and its eigenvectors are found by
     Lanczos iterations, so that they are orthogonal and nothing of size N squared is formed.
 
-    Parameters
-    ----------
-    columns : FloatArray
-        (N, m) similarity of each item to each landmark.
-    landmarks : IntArray
-        (m,) indices of the landmarks; m at least ``classes``.
+    ``columns``: (N, m) similarity of each item to each landmark. ``landmarks``: (m,) indices of the landmarks; m at least
+    ``classes``.
     """
     block = columns[landmarks]
     values, vectors = eigh(0.5 * (block + block.T))

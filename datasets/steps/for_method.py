@@ -86,7 +86,7 @@ class Alignment:
         return (self.moves[-1].width, self.moves[-1].height) if self.moves else self.source
 
     def camera(self, camera: Camera) -> Camera:
-        """The camera of the aligned images. Raises `InputError` for one of another size than `source`."""
+        """The camera of the aligned images."""
         _check_size(f"camera {camera.id}", self.source, (camera.width, camera.height))
         for move in self.moves:
             if isinstance(move, Resize):
@@ -111,7 +111,7 @@ class Alignment:
     def restore(self, render: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
         """Convert an (H, W, 3) render of the aligned view to the source's size, in one antialiased resizing.
 
-        Cropped parts become ``background``. Raises `InputError` for a render of another size than `aligned_size`.
+        Cropped parts become ``background``.
         """
         _check_size("render", self.aligned_size, (render.shape[1], render.shape[0]))
         boxes = [move for move in self.moves if isinstance(move, PixelBox)]

@@ -58,10 +58,7 @@ def packed_chart(vertices: FloatArray, faces: IntArray) -> FloatArray:
 
     Triangles have the same scale and are sheared by `SHEAR`, so that areas in the chart are proportional to those on the mesh.
 
-    Parameters
-    ----------
-    vertices, faces : FloatArray, IntArray
-        (V, 3) metres, (F, 3).
+    ``vertices``, ``faces``: (V, 3) metres, (F, 3).
     """
     v0, v1, v2 = np.moveaxis(np.asarray(vertices, np.float64)[faces], 1, 0)
     # A triangle without area stays one: no division by 0.

@@ -262,20 +262,10 @@ def ribbons(
 ) -> Strands:
     """Tapered ribbons around paths (n, k, 3).
 
-    Parameters
-    ----------
-    outward : FloatArray
-        (n, k, 3) or (n, 1, 3) direction that a ribbon's flat side faces.
-    width : FloatArray
-        (n,) metres, at the widest.
-    color : FloatArray
-        (n, c, 3) linear reflectance across each ribbon, c >= 2 columns.
-    tip_shade : float
-        Factor on the colour at the tip (above 1 for sun-bleached tips).
-    tip_width, root_width : float
-        Width at the ends relative to the widest.
-    arch : float
-        Height of the middle above the edges, relative to the width.
+    ``outward``: (n, k, 3) or (n, 1, 3) direction that a ribbon's flat side faces. ``width``: (n,) metres, at the widest.
+    ``color``: (n, c, 3) linear reflectance across each ribbon, c >= 2 columns. ``tip_shade``: Factor on the colour at the
+    tip (above 1 for sun-bleached tips). ``tip_width``, ``root_width``: Width at the ends relative to the widest. ``arch``:
+    Height of the middle above the edges, relative to the width.
     """
     count, points = paths.shape[:2]
     columns = color.shape[1]

@@ -159,12 +159,8 @@ def window(camera: Camera, points: FloatArray) -> tuple[slice, slice]:
 class PanelTracer:
     """A scene lit by panels; meshes have constant triangles and may change positions and colours.
 
-    Parameters
-    ----------
-    samples : int
-        Rays per pixel, rounded up to a square number.
-    seed : int
-        Seed of the points on the panels that each vertex samples.
+    ``samples``: Rays per pixel, rounded up to a square number. ``seed``: Seed of the points on the panels that each vertex
+    samples.
     """
 
     def __init__(

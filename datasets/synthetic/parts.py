@@ -42,12 +42,8 @@ def render_parts(
 ) -> list[MouthMesh]:
     """Teeth, gums and tongue in a subject's neutral shape.
 
-    Parameters
-    ----------
-    shape : FloatArray | None
-        (S,) identity coefficients; the mean head if None. Parts follow the surrounding wall of the mouth.
-    tongue_out : float
-        0 places the tongue behind the lower teeth, 1 over the lower lip (the jaw should be open).
+    ``shape``: (S,) identity coefficients; the mean head if None. Parts follow the surrounding wall of the mouth.
+    ``tongue_out``: 0 places the tongue behind the lower teeth, 1 over the lower lip (the jaw should be open).
     """
     if "mouth_socket" not in head.regions or not head.version.startswith("procedural"):
         raise InputError(f"head model {head.version!r}", "regions", "a procedural head", "another head")

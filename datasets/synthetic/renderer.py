@@ -119,14 +119,8 @@ def _distance(covered: BoolArray) -> FloatArray:
 def matte(alpha: FloatArray, hair: FloatArray, level: float, metre: float, seed: int) -> FloatArray:
     """(H, W) coverage as a matting network gives it: at ``hair`` (H, W) without single hairs, and displaced.
 
-    Parameters
-    ----------
-    alpha : FloatArray
-        (H, W) coverage.
-    level : float
-        The outline of hair is displaced by up to `MATTE_METRES` times this; below 1, it also keeps a part of its hairs.
-    seed : int
-        Of the field that displaces.
+    ``alpha``: (H, W) coverage. ``level``: The outline of hair is displaced by up to `MATTE_METRES` times this; below 1, it
+    also keeps a part of its hairs. ``seed``: Of the field that displaces.
     """
     reach = _SOFT * metre
     core = _distance(alpha <= 0.5) > reach

@@ -232,12 +232,8 @@ class LatePoses:
 class RenderedSubject:
     """A subject's visible body over a head model.
 
-    Parameters
-    ----------
-    shape : FloatArray
-        (S,) identity coefficients.
-    correctives : float
-        Level of shapes of the skin that the head model lacks, see `correctives`.
+    ``shape``: (S,) identity coefficients. ``correctives``: Level of shapes of the skin that the head model lacks, see
+    `correctives`.
     """
 
     def __init__(
@@ -469,14 +465,8 @@ class FineMesh:
 def refine(vertices: FloatArray, faces: IntArray, target: FloatArray) -> FineMesh:
     """Split the edges longer than wanted, conformingly, at most `_ROUNDS` times.
 
-    Parameters
-    ----------
-    vertices : FloatArray
-        (V, 3) tracked mesh at rest, metres.
-    faces : IntArray
-        (F, 3) triangles to refine; unused vertices are left out.
-    target : FloatArray
-        (V,) longest edge wanted around each vertex, metres.
+    ``vertices``: (V, 3) tracked mesh at rest, metres. ``faces``: (F, 3) triangles to refine; unused vertices are left out.
+    ``target``: (V,) longest edge wanted around each vertex, metres.
     """
     used, local = np.unique(faces, return_inverse=True)
     triangles: IntArray = local.reshape(faces.shape).astype(np.int64)

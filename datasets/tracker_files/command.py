@@ -85,8 +85,7 @@ def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_pr
     """Make a capture from the files of another tracker and the frames of the video.
 
     Writes under ``settings.out`` ``overlay.png`` with the mesh over a few images, the capture (PNG images without separate
-    masks are linked, others are composited on white), and ``import.json``. Raises `InputError` for files that cannot be
-    read and for images that do not belong to them, before anything is written.
+    masks are linked, others are composited on white), and ``import.json``.
     """
     from ..clip import check_apart
     from ..head.refit.command import target_head

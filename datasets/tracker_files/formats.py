@@ -38,7 +38,7 @@ METRICAL_MEMBERS = {
 
 
 def metrical_frame(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> TrackedFrame:
-    """A timestep of the arrays in `METRICAL_MEMBERS`. Raises `InputError` for invalid rotations."""
+    """A timestep of the arrays in `METRICAL_MEMBERS`."""
     motion = np.eye(4)
     motion[:3] = np.column_stack([arrays["opencv.R"][0], arrays["opencv.t"][0]])
     width, height = image_size(path, arrays)
@@ -86,10 +86,7 @@ PIXEL3DMM_MEMBERS = {
 
 
 def pixel3dmm_frame(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> TrackedFrame:
-    """A timestep of the arrays in `PIXEL3DMM_MEMBERS`.
-
-    Raises `InputError` for rotations that are none, several cameras, and an image that is not square.
-    """
+    """A timestep of the arrays in `PIXEL3DMM_MEMBERS`."""
     if "camera.R_base_1" in arrays:
         raise InputError(path, "camera.R_base_1", "one camera", "several")
     width, height = image_size(path, arrays)
@@ -155,10 +152,7 @@ FORMATS = {
 
 
 def recognise(root: Path, name: str = "") -> TrackerFormat:
-    """The format ``name``, or the one of the files under ``root``.
-
-    Raises `InputError` for an unknown name, a folder without such files, and files of no known tracker.
-    """
+    """The format ``name``, or the one of the files under ``root``."""
     if name and name not in FORMATS:
         raise InputError("command line", "--format", ", ".join(FORMATS), repr(name))
     known = "; ".join(one.summary for one in FORMATS.values())

@@ -76,16 +76,9 @@ def find_pictures(
 ) -> VideoPictures:
     """Find the image and the mask of every frame.
 
-    Parameters
-    ----------
-    root : Path
-        The tracker's output.
-    numbers : Sequence[int]
-        Numbers of the frames.
-    images, masks : str
-        Folders; "" takes those of the layout, in ``root`` and, for images, beside it.
-    first : int | None
-        Number of the image of frame 0; None takes that of the layout.
+    ``root``: The tracker's output. ``numbers``: Numbers of the frames. ``images``, ``masks``: Folders; "" takes those of
+    the layout, in ``root`` and, for images, beside it. ``first``: Number of the image of frame 0; None takes that of the
+    layout.
     """
     folder = _image_folder(root, layout, images)
     found = _numbered(folder)
@@ -232,10 +225,7 @@ Convert = Callable[[Path, int, Mapping[str, np.ndarray]], TrackedFrame]
 
 
 def frame_files(root: Path) -> dict[int, Path]:
-    """Files of the timesteps by number, in ``root`` or its folder ``checkpoint``; {} if there are none.
-
-    Raises `InputError` for a name without a number, and for two names with the same one.
-    """
+    """Files of the timesteps by number, in ``root`` or its folder ``checkpoint``; {} if there are none."""
     found: dict[int, Path] = {}
     for path in entries(root, f"*{SUFFIX}") or entries(root / FOLDER, f"*{SUFFIX}"):
         number = frame_number(path, "", path.stem)
@@ -248,10 +238,7 @@ def frame_files(root: Path) -> dict[int, Path]:
 
 
 def read_members(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of a file, with dots in the names of those in dictionaries inside.
-
-    Raises `InputError` as `read_saved` does; nothing in the file is executed.
-    """
+    """All arrays of a file, with dots in the names of those in dictionaries inside."""
     found: dict[str, np.ndarray] = {}
     for name, value in read_saved(path).items():
         inside: Mapping[str, Any] = value if isinstance(value, dict) else {}
@@ -263,11 +250,7 @@ def read_members(path: Path) -> dict[str, np.ndarray]:
 def read_frames(
     files: Mapping[int, Path], members: Mapping[str, Member], convert: Convert
 ) -> list[TrackedFrame]:
-    """Read the timesteps of one video.
-
-    Raises `InputError` for the first file that is damaged, lacks an array or has one of another shape than ``members``
-    say or than the first file has, and where image size or identity differ from those of the first file.
-    """
+    """Read the timesteps of one video."""
     frames: list[TrackedFrame] = []
     sizes: dict[str, int] = {}
     for number, path in files.items():
@@ -294,7 +277,7 @@ SAME_IDENTITY = 1e-5
 
 
 def image_size(path: Path, arrays: Mapping[str, np.ndarray]) -> tuple[int, int]:
-    """Width and height of the tracked image; files have height and width. Raises `InputError` for no size."""
+    """Width and height of the tracked image; files have height and width."""
     height, width = (int(value) for value in arrays["img_size"])
     if min(width, height) < 1:
         raise InputError(path, "img_size", "height and width in pixels", f"{height}, {width}")
@@ -315,14 +298,8 @@ def video_track(
 ) -> Track:
     """Join frames, images and head model.
 
-    Parameters
-    ----------
-    frames : Sequence[TrackedFrame]
-        Of one video, at least one.
-    head : HeadArrays
-        Coefficients beyond its bases must be zero; missing ones are zero.
-    resized : bool
-        Whether images may have another size than the ones tracked, with the same ratio of width to height.
+    ``frames``: Of one video, at least one. ``head``: Coefficients beyond its bases must be zero; missing ones are zero.
+    ``resized``: Whether images may have another size than the ones tracked, with the same ratio of width to height.
     """
     identities, expressions = head.shape_basis.shape[2], head.expression_basis.shape[2]
     found = []

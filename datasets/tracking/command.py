@@ -41,7 +41,6 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
 
     Writes under ``settings.out`` the capture (images linked), ``track.json`` with every timestep's residuals and
     ``overlay.png``. Intermediate results are stored there, so that an interrupted call can be resumed.
-    Raises `InputError` before the fit for a capture that cannot be tracked or written.
     """
     from ..clip import check_apart
     from ..head.refit.rewrite import capture_plan, write_capture

@@ -47,14 +47,8 @@ class NormalEquations:
     def add(self, timestep: int, posed: PosedPoints, curvature: FloatArray, slope: FloatArray) -> None:
         """Add the points of a timestep.
 
-        Parameters
-        ----------
-        posed : PosedPoints
-            P points and their derivatives.
-        curvature : FloatArray
-            (P, 3, 3) second derivatives of the cost by the points, without those of the residuals.
-        slope : FloatArray
-            (P, 3) negative first derivatives of the cost by the points.
+        ``posed``: P points and their derivatives. ``curvature``: (P, 3, 3) second derivatives of the cost by the points,
+        without those of the residuals. ``slope``: (P, 3) negative first derivatives of the cost by the points.
         """
         jacobian = np.concatenate([posed.by_pose, posed.by_shape], axis=2)
         bent = np.einsum("pij,pjk->pik", curvature.astype(jacobian.dtype), jacobian)
@@ -66,10 +60,7 @@ class NormalEquations:
     def step(self, state: HeadState, prior: HeadPrior, damping: float = 1e-6) -> HeadState:
         """The state after a step with the prior.
 
-        Parameters
-        ----------
-        damping : float
-            Fraction of the diagonal that is added to it (Levenberg-Marquardt).
+        ``damping``: Fraction of the diagonal that is added to it (Levenberg-Marquardt).
         """
         split = self._split
         deviations = np.concatenate([prior.pose, prior.shape])
@@ -157,7 +148,7 @@ class Observations(NamedTuple):
 
 
 def sampled_vertices(head: HeadAsset) -> IntArray:
-    """Vertices whose colours are compared, spread over the regions `PARTS`. Raises `InputError` if the head has none of them."""
+    """Vertices whose colours are compared, spread over the regions `PARTS`."""
     inner = ("mouth_socket", "teeth", "boundary")
     taken = np.concatenate([np.asarray(head.regions.get(name, ()), np.int64) for name in inner])
     chosen = []
@@ -411,12 +402,8 @@ def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, s
     taken. Landmarks have systematic errors of some millimetres, and a near face with a short lens looks like a longer face, so that
     the estimate may be wrong by a quarter.
 
-    Parameters
-    ----------
-    landmarks : ImageLandmarks
-        (T, 1, L, 2) pixels of ``camera``.
-    side : float
-        Longer side of the camera's whole picture in pixels of ``camera``, before it was cropped.
+    ``landmarks``: (T, 1, L, 2) pixels of ``camera``. ``side``: Longer side of the camera's whole picture in pixels of
+    ``camera``, before it was cropped.
     """
     part = landmarks.of(landmarks.seen)
     part = part.of(np.unique(np.linspace(0, len(part.pixels) - 1, FRAMES).astype(int)))

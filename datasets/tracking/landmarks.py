@@ -79,10 +79,7 @@ def learn_embedding(
     pictures: Iterable[PicturedMesh],
     progress: Progress = no_progress,
 ) -> Embedding:
-    """Positions of the network's landmarks on the mesh: medians over images.
-
-    Raises `InputError` if the network finds hardly any landmark in the pictures.
-    """
+    """Positions of the network's landmarks on the mesh: medians over images."""
     template = np.asarray(head.template, np.float64)
     places: list[FloatArray] = []
     found: FloatArray | None = None
@@ -162,10 +159,7 @@ def spread_vertices(points: FloatArray, count: int) -> IntArray:
 
 
 def rig_vertices(head: HeadAsset) -> IntArray:
-    """Vertices that serve as landmarks of a known rig, spread over lips, eye regions and face.
-
-    Raises `InputError` if the head model has no face region.
-    """
+    """Vertices that serve as landmarks of a known rig, spread over lips, eye regions and face."""
     region(head, "face")
     taken: list[IntArray] = []
     hidden = [np.asarray(head.regions.get(name, ()), np.int64) for name in ("mouth_socket", "teeth")]
@@ -222,7 +216,7 @@ IRIS, IRIS_SHARE = (0.20, 0.15, 0.10), 0.15
 
 
 def drawn_head(head: HeadAsset) -> Iterator[PicturedMesh]:
-    """Pictures of the mean head from the front and from both sides. Raises `InputError` for a head model without a face."""
+    """Pictures of the mean head from the front and from both sides."""
     mesh = np.asarray(head.template, np.float64)
     face = mesh[region(head, "face")]
     middle, height = (face.min(axis=0) + face.max(axis=0)) / 2, float(np.ptp(face[:, 1]))
@@ -272,12 +266,8 @@ def found_in_images(
 class NetworkLandmarks:
     """Landmark source: detections of the network in the images of some cameras of a clip.
 
-    Parameters
-    ----------
-    finder : Finder
-        The network's landmarks, `found_in_images` or those that are known.
-    embedding : Embedding
-        Where the network's landmarks are on the head model.
+    ``finder``: The network's landmarks, `found_in_images` or those that are known. ``embedding``: Where the network's
+    landmarks are on the head model.
     """
 
     def __init__(
@@ -340,10 +330,7 @@ def head_embedding(
     progress: Progress = no_progress,
 ) -> Embedding:
     """Embedding of the network's landmarks on a head model, learnt from a clip of another subject with exact tracking or from
-    renderings of the head model.
-
-    Raises `InputError` if the clip has another head model.
-    """
+    renderings of the head model."""
     if teacher is None:
         return learn_embedding(network, head, drawn_head(head), progress)
     if teacher.head.version != head.version:
@@ -360,10 +347,7 @@ def landmark_source(
     progress: Progress = no_progress,
 ) -> Callable[[Sequence[int]], ImageLandmarks]:
     """Landmarks of a clip by timesteps: those of the network in the file ``landmarks``, else of a known rig with an error of
-    ``seed``. ``teacher`` is that of `head_embedding`.
-
-    Raises `InputError` if a teacher is given without a file, or if its head model differs.
-    """
+    ``seed``. ``teacher`` is that of `head_embedding`."""
     if not landmarks:
         if teacher is not None:
             raise InputError("settings of the tracker", "landmarks", "a value beside embedding", "none")

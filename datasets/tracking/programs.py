@@ -167,10 +167,7 @@ def export_folder(work: WorkingFolder) -> Path:
 
 
 def check_program(name: str, checkout: Path, python: str) -> tuple[TrackingProgram, Path]:
-    """The program of a name, whose checkout and interpreter are complete, and the interpreter's path.
-
-    Raises `InputError` as `check_checkout` and `check_interpreter`.
-    """
+    """The program of a name, whose checkout and interpreter are complete, and the interpreter's path."""
     check_checkout(name, checkout)
     return PROGRAMS[name], check_interpreter(name, python)
 
@@ -287,7 +284,7 @@ def pixel3dmm(settings: Mapping[str, Any], device: str) -> Iterator[Need]:
 
 
 def _needs(name: str, settings: Mapping[str, Any]) -> Iterator[Need]:
-    """Needs of a program. Raises `InputError` for settings that it does not have."""
+    """Needs of a program."""
     place = build(ProgramPlace, settings, "command line", f"--set settings.{name}.")
     if not place.checkout:
         remedy = (
@@ -322,7 +319,7 @@ def track_with_program(settings: TrackSettings, progress: Progress) -> CommandRe
     """Run another tracker on the file of a video and convert its output to a capture.
 
     Its files are in a folder of its name in ``settings.out``, the capture beside it. A repeated call resumes after the last
-    finished step. Raises `InputError` before anything runs, and `ProgramError` for a program that fails.
+    finished step.
     """
     source, name = Path(settings.capture), settings.program
     if not is_video(source):

@@ -103,16 +103,8 @@ class _Posed(NamedTuple):
 class PointRig:
     """P points on a head model.
 
-    Parameters
-    ----------
-    head : HeadAsset
-        Head model in FLAME's layout.
-    corners : IntArray
-        (P, 3) vertices of each point.
-    weights : FloatArray
-        (P, 3) their shares, rows sum to 1.
-    dtype : type
-        Type of the points and of the derivatives.
+    ``head``: Head model in FLAME's layout. ``corners``: (P, 3) vertices of each point. ``weights``: (P, 3) their shares,
+    rows sum to 1. ``dtype``: Type of the points and of the derivatives.
     """
 
     def __init__(self, head: HeadAsset, corners: IntArray, weights: FloatArray, dtype: Any = np.float32):
@@ -233,12 +225,8 @@ WORSE = 2.5
 def outliers(poses: FloatArray, residuals: FloatArray, columns: PoseColumns) -> BoolArray:
     """(T,) timesteps without a fit to landmarks, with a jump of the head, or with a much larger residual than their neighbours.
 
-    Parameters
-    ----------
-    poses : FloatArray
-        (T, D) columns of ``columns``.
-    residuals : FloatArray
-        (T, 2) `TimestepResidual` without the timestep; 0 pixels where no landmark was used.
+    ``poses``: (T, D) columns of ``columns``. ``residuals``: (T, 2) `TimestepResidual` without the timestep; 0 pixels where
+    no landmark was used.
     """
     turns = (rotation_of(poses[:, :3]) * rotation_of(poses[:, 3:6])).as_matrix().reshape(-1, 9)
     wrong = (residuals[:, 0] <= 0) | (residuals > WORSE * _median(residuals)).any(axis=1)

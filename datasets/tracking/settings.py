@@ -38,7 +38,7 @@ def check_work_folder(folder: Path) -> None:
 
 
 def make_work_folder(folder: Path) -> None:
-    """Make the folder, with a note that says what it is. Raises `InputError` as `check_work_folder`, and if it cannot be made."""
+    """Make the folder, with a note that says what it is."""
     check_work_folder(folder)
     check_output_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -71,10 +71,7 @@ def error_regions(head: HeadAsset) -> dict[str, IntArray]:
 
 
 def tracking_errors(tracked: Clip, exact: Clip) -> Mapping[str, RegionError]:
-    """Errors of a clip's tracking against that of another clip of the same subject, by region.
-
-    Raises `InputError` if the clips do not share timesteps or have head models of other topologies.
-    """
+    """Errors of a clip's tracking against that of another clip of the same subject, by region."""
     where = f"clip of {tracked.subject}"
     if tracked.head.faces.shape != exact.head.faces.shape or not np.array_equal(
         tracked.head.faces, exact.head.faces
@@ -197,16 +194,9 @@ def track(
     Neither shape, poses nor static offset of the clip are used, other than by ``source``. The shape is estimated with the
     first timesteps, spread over the clip, and kept for the others.
 
-    Parameters
-    ----------
-    cameras : Sequence[str]
-        Cameras whose images are used; one is enough.
-    source : LandmarkSource
-        Finds landmarks.
-    notes : Mapping[str, Any] | None
-        Recorded with the step.
-    store : Path | None
-        Folder that keeps the fit of every part, which a later call with the same images and landmarks does not repeat.
+    ``cameras``: Cameras whose images are used; one is enough. ``source``: Finds landmarks. ``notes``: Recorded with the
+    step. ``store``: Folder that keeps the fit of every part, which a later call with the same images and landmarks does not
+    repeat.
     """
     where = f"clip of {clip.subject}"
     check_cameras(clip, cameras)
@@ -275,7 +265,7 @@ def track(
 
 
 def without_timesteps(clip: CaptureClip, left_out: Collection[int]) -> CaptureClip:
-    """A clip without the frames of some timesteps. Raises `InputError` if no training frame remains."""
+    """A clip without the frames of some timesteps."""
     splits = {
         name: tuple(key for key in keys if key.timestep not in left_out) for name, keys in clip.splits.items()
     }

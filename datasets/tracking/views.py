@@ -14,10 +14,7 @@ from ..head.geometry import triangle_areas, vertex_normals
 class FrameStack:
     """Images of N frames as one row of pixels.
 
-    Parameters
-    ----------
-    images : list[ByteArray]
-        (H, W, 3) 8-bit images; sizes may differ.
+    ``images``: (H, W, 3) 8-bit images; sizes may differ.
     """
 
     def __init__(self, images: list[ByteArray]):
@@ -95,10 +92,7 @@ class Projection(NamedTuple):
 class Views:
     """C cameras.
 
-    Parameters
-    ----------
-    cameras : Sequence[Camera]
-        Cameras of any sizes.
+    ``cameras``: Cameras of any sizes.
     """
 
     def __init__(self, cameras: Sequence[Camera]):
@@ -143,14 +137,7 @@ class Occlusion:
     The surface is sampled every few millimetres and the nearest depth in every cell of `CELL` pixels is kept. This is
     a hundred times faster than drawing the mesh and as exact as robust estimates need.
 
-    Parameters
-    ----------
-    head : HeadAsset
-        Head model, for its triangles.
-    neutral : FloatArray
-        (V, 3) a mesh of the subject's size, metres.
-    views : Views
-        Cameras.
+    ``head``: Head model, for its triangles. ``neutral``: (V, 3) a mesh of the subject's size, metres. ``views``: Cameras.
     """
 
     def __init__(self, head: HeadAsset, neutral: FloatArray, views: Views):
@@ -169,12 +156,7 @@ class Occlusion:
     def visible(self, mesh: FloatArray, vertices: IntArray) -> FloatArray:
         """(C, n) cosine between normal and direction to the camera at vertices that are seen, else 0.
 
-        Parameters
-        ----------
-        mesh : FloatArray
-            (V, 3) posed mesh, metres.
-        vertices : IntArray
-            (n,) vertices.
+        ``mesh``: (V, 3) posed mesh, metres. ``vertices``: (n,) vertices.
         """
         normals = vertex_normals(mesh, self._faces)[vertices]
         points = mesh[vertices]

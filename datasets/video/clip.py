@@ -107,12 +107,7 @@ class Background(NamedTuple):
 def learn_background(path: Path, images: Sequence[ByteArray]) -> Background:
     """The median of each pixel over frames that do not show a face, most of which have to show the empty room.
 
-    Parameters
-    ----------
-    path : Path
-        The video, for messages.
-    images : Sequence[ByteArray]
-        Images (H, W, 3) of one view.
+    ``path``: The video, for messages. ``images``: Images (H, W, 3) of one view.
     """
     if len(images) < LEAST_EMPTY:
         expected = f"at least {LEAST_EMPTY} frames that show nobody's face, {_USE}"
@@ -221,10 +216,7 @@ class MaskSource:
         return self.options.masks == BACKGROUND
 
     def prepare(self, numbers: Sequence[int], info: VideoInfo) -> str:
-        """Check the inputs of the masks of frames with these numbers; returns a digest of the inputs.
-
-        Raises `InputError` unless a folder of masks has one of the video's size for every frame.
-        """
+        """Check the inputs of the masks of frames with these numbers; returns a digest of the inputs."""
         if self._file is not None:
             return digest_file(self._file)
         if not self or self.by_background:
@@ -238,10 +230,7 @@ class MaskSource:
         return digest([*content_digests(files).values()])
 
     def learn(self, path: Path, frames: Iterable[TimedFrame], faces: FoundFaces, view: FrameView) -> None:
-        """Learn the background from the frames of a video that show nobody's face, where masks are made from it.
-
-        Raises `InputError` as `learn_background` and `check_background`.
-        """
+        """Learn the background from the frames of a video that show nobody's face, where masks are made from it."""
         if not self.by_background:
             return
         empty = evenly_with_ends(np.flatnonzero(~faces.found & (faces.others == 0)).tolist(), SAMPLES)
@@ -317,9 +306,6 @@ def open_video(
     """Read a video, write its frames and masks under ``out``, and return them as a clip in a neutral pose.
 
     Files that an earlier call with the same video and options wrote there are reused.
-
-    Raises `InputError` before images are written for a file that is not a video, masks that do not fit, too few frames with a
-    face, and an unspecified source of masks.
     """
     subject = options.subject or subject_of(path)
     check_subject(subject, "--subject")

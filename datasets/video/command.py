@@ -49,7 +49,7 @@ class OpenedVideo(NamedTuple):
 def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) -> OpenedVideo:
     """The clip of a video with its focal length.
 
-    Its frames and results are stored in ``folder``, from which a later call resumes. Raises `InputError` as `open_video`.
+    Its frames and results are stored in ``folder``, from which a later call resumes.
     """
     path = Path(settings.capture)
     named = settings.head or EMBEDDED

@@ -42,7 +42,7 @@ SHARED = 64
 
 
 class FaceDetector:
-    """The network in a file. Raises as `open_network`, and `InputError` for another network."""
+    """The network in a file."""
 
     def __init__(self, path: Path):
         expected = "a network that detects faces"
@@ -248,12 +248,7 @@ class FaceFollower:
     def follow(self, image: ByteArray, time: float, search: bool) -> FloatArray | None:
         """The person's landmarks in the next frame, (COUNT, 2) pixels, or None.
 
-        Parameters
-        ----------
-        time : float
-            Of the frame, seconds.
-        search : bool
-            Whether to search for further faces even if the person's is found.
+        ``time``: Of the frame, seconds. ``search``: Whether to search for further faces even if the person's is found.
         """
         own = None if self.lost or self.last is None else self._near(image, self.last)
         others: list[FloatArray] = []
@@ -327,16 +322,9 @@ def find_faces(
 ) -> FoundFaces:
     """Landmarks of one person in all frames, by `FaceFollower`.
 
-    Parameters
-    ----------
-    path : Path
-        The video, for messages.
-    frames : Iterable[TimedFrame]
-        Its frames; not iterated if an earlier call has finished.
-    store : Path
-        File of the landmarks, written during the search; a later call skips its frames.
-    mark : str
-        Digest of everything that the landmarks depend on.
+    ``path``: The video, for messages. ``frames``: Its frames; not iterated if an earlier call has finished. ``store``: File
+    of the landmarks, written during the search; a later call skips its frames. ``mark``: Digest of everything that the
+    landmarks depend on.
     """
     kept = stored_arrays(store, mark, _STORED)
     if kept is None or not kept["finished"]:

@@ -193,10 +193,7 @@ class ExpressionBasis:
 def principal_basis(shapes: dict[str, FloatArray], deviation: FloatArray, seed: int) -> ExpressionBasis:
     """Principal components of ``shapes`` under correlated normal activations.
 
-    Parameters
-    ----------
-    shapes : dict[str, FloatArray]
-        K displacements (V, 3).
+    ``shapes``: K displacements (V, 3).
 
     Notes
     -----
@@ -277,10 +274,7 @@ def lid_turn(surface: SculptedHead, upper: FloatArray | float, lower: FloatArray
     The margins and the inner sides of the lids rotate rigidly about the eyeball; the surrounding skin follows by the
     harmonic field between the margins and fixed vertices.
 
-    Parameters
-    ----------
-    upper, lower : FloatArray | float
-        Rotation of each margin, radians, positive up; a number, or one for each vertex.
+    ``upper``, ``lower``: Rotation of each margin, radians, positive up; a number, or one for each vertex.
     """
     relative = surface.vertices - EYE_CENTER
     x, y, z = relative.T

@@ -242,17 +242,10 @@ def coarsen(
 ) -> tuple[FloatArray, IntArray]:
     """Coarse mesh of a fine one.
 
-    Parameters
-    ----------
-    vertices, faces : FloatArray, IntArray
-        The fine mesh, manifold, with at least about three edges per target edge.
-    size : FloatArray
-        (V,) target edge length, metres.
-    fixed : IntArray
-        Fine vertices that become coarse vertices unchanged.
-    border : IntArray
-        (V,) bit set of the border lines through each fine vertex (0 inside). A coarse vertex whose
-        cluster touches border lines stays on them, so borders keep their shape.
+    ``vertices``, ``faces``: The fine mesh, manifold, with at least about three edges per target edge. ``size``: (V,) target
+    edge length, metres. ``fixed``: Fine vertices that become coarse vertices unchanged. ``border``: (V,) bit set of the
+    border lines through each fine vertex (0 inside). A coarse vertex whose cluster touches border lines stays on them, so
+    borders keep their shape.
 
     Returns
     -------

@@ -92,14 +92,8 @@ def named_expressions(version: str, names: Sequence[str], size: int) -> list[Exp
 
     Blinks represented by eyelid bases are not included, since they are no expression coefficients.
 
-    Parameters
-    ----------
-    version : str
-        Of the head model.
-    names : Sequence[str]
-        Names of its expression directions; () if they have none.
-    size : int
-        E, the number of expression directions.
+    ``version``: Of the head model. ``names``: Names of its expression directions; () if they have none. ``size``: E, the
+    number of expression directions.
     """
     if version in VERSIONS:
         matrix, _ = semantic_to_coefficients(version)

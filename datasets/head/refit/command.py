@@ -30,7 +30,7 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     A killed command continues at the last block of timesteps when it is run again.
 
     Writes under ``settings.out`` the capture (images linked), ``refit.json`` with every timestep's residuals and
-    ``heat_map.png``. Raises `InputError` before any fitting if capture and head model do not match.
+    ``heat_map.png``.
     """
     from ...clip import check_apart
     from ...images import write_image

@@ -52,10 +52,7 @@ class Matching:
 
 
 def fitted_vertices(head: HeadAsset, settings: RefitSettings) -> tuple[IntArray, FloatArray]:
-    """Vertices of the face and the eyeballs, (n,) ascending, and their weights (n,).
-
-    Raises `InputError` if the head has no face region.
-    """
+    """Vertices of the face and the eyeballs, (n,) ascending, and their weights (n,)."""
     weights = np.zeros(len(head.template))
     weights[region(head, FACE)] = 1.0
     for name, factor in (("lips", settings.lips), ("eye_region", settings.eye_region)):
@@ -80,10 +77,7 @@ def match(source: HeadAsset, neutral: FloatArray, target: HeadAsset, settings: R
     region by region, alternated with a rigid alignment and the identity, and initialised by aligning the centres of
     common regions.
 
-    Parameters
-    ----------
-    neutral : FloatArray
-        (V source, 3) metres.
+    ``neutral``: (V source, 3) metres.
     """
     vertices, weights = fitted_vertices(target, settings)
     if same_topology(source, target):

@@ -57,15 +57,9 @@ def refit(
     arXiv 2504.14967), supplement, on comparing with monocular methods: vertex distance over the facial region
     only, identity from the neutral head. The rigid motion of the head is kept exactly.
 
-    Parameters
-    ----------
-    clip : CaptureClip
-        Clip tracked with any head model.
-    target : HeadArrays
-        Head model to fit. If the clip's head has teeth of `with_teeth` and the target does not, they
-        are added.
-    folder : Path | None
-        Cache of finished blocks of timesteps; a second call with the same input continues.
+    ``clip``: Clip tracked with any head model. ``target``: Head model to fit. If the clip's head has teeth of `with_teeth`
+    and the target does not, they are added. ``folder``: Cache of finished blocks of timesteps; a second call with the same
+    input continues.
     """
     settings = settings or RefitSettings()
     timesteps = sorted(clip.poses)

@@ -64,7 +64,6 @@ class BenchmarkTrack:
         """All videos of a submission.
 
         ``data`` is the benchmark's folder; its tracking gives the number of frames if that is not published.
-        Raises `InputError` for tracking that is missing or damaged.
         """
         for participant, sequences in self.sequences.items():
             for sequence, frames in sequences.items():
@@ -101,7 +100,7 @@ TRACKS: Mapping[TrackName, BenchmarkTrack] = {track.name: track for track in (NV
 
 
 def tracking_file(data: Path, participant: str, sequence: str) -> Path:
-    """Tracking of a sequence in the benchmark's folder. Raises `InputError` if it is missing or of version 1."""
+    """Tracking of a sequence in the benchmark's folder."""
     folder = data / "mono_flame_avatar" / participant / "sequences" / sequence / "tracking"
     path = folder / TRACKING_FILE
     if not path.is_file():
@@ -128,7 +127,7 @@ MEMBERS = {
 
 
 def tracked_frames(path: Path) -> int:
-    """Timesteps of a tracking file. Raises `InputError` for other files."""
+    """Timesteps of a tracking file."""
     return len(read_arrays(path, MEMBERS)["expression"])
 
 
@@ -149,13 +148,8 @@ def find_frames(
     They are ``<folder>/<participant>/<sequence>_<timestep>_<serial>.png``, or those of a run's method:
     ``<folder>/<participant>/<method>/seed-<n>/renders/<task>/...``.
 
-    Parameters
-    ----------
-    method : str
-        Method to use from a run with several.
-    data : Path | None
-        The benchmark's folder, which gives the number of frames of a sequence if that is not
-        published.
+    ``method``: Method to use from a run with several. ``data``: The benchmark's folder, which gives the number of frames of
+    a sequence if that is not published.
     """
     found: dict[Video, list[Path]] = {}
     by_participant = {name: _by_camera(folder, name, method) for name in track.sequences}
@@ -324,13 +318,8 @@ def check_submission(
     """Check a zip like the server does (files, frame counts, sizes), and also decode every frame and check codec and
     rate.
 
-    Parameters
-    ----------
-    data : Path | None
-        The benchmark's folder; without it, frames of the monocular track are only compared with the
-        published totals.
-    name : str
-        Name of the track; "" takes the one with the most files in the zip.
+    ``data``: The benchmark's folder; without it, frames of the monocular track are only compared with the published totals.
+    ``name``: Name of the track; "" takes the one with the most files in the zip.
     """
     issues = Issues()
     with reading(file, "the zip of a submission"):

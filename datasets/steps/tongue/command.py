@@ -47,10 +47,7 @@ DECISIONS_FILE = "tongue.yaml"
 
 @command("prepare tongue", group="data", writes="out")
 def tongue(settings: TongueSettings, progress: Progress) -> CommandResult:
-    """Find the frames that show the tongue, for review on a contact sheet.
-
-    Raises `InputError` before any image is read, for captures and decisions that cannot be read.
-    """
+    """Find the frames that show the tongue, for review on a contact sheet."""
     from ..exclude import read_exclusions, write_exclusions
 
     _check(settings)

@@ -180,14 +180,8 @@ def decide(
 ) -> Exclusions:
     """Decide every timestep.
 
-    Parameters
-    ----------
-    timesteps : Mapping[int, str]
-        Sequence by timestep, in the order of the evidence.
-    threshold : float | None
-        mm²; None chooses one automatically.
-    overrides : Mapping[int, str]
-        Manual decisions, see `Exclusions`.
+    ``timesteps``: Sequence by timestep, in the order of the evidence. ``threshold``: mm²; None chooses one automatically.
+    ``overrides``: Manual decisions, see `Exclusions`.
     """
     basis = "given"
     if threshold is None:

@@ -74,10 +74,7 @@ class MouthAtlas:
 
 
 def mouth_atlas(clip: Clip) -> MouthAtlas:
-    """Create the map for a clip's subject.
-
-    Raises `InputError` where the head lacks the regions "lips" or "face", or its lower lip does not follow the jaw.
-    """
+    """Create the map for a clip's subject."""
     head = clip.head
     where = f"head model {head.version!r}"
     lip_region, face = (region(head, name) for name in ("lips", "face"))
@@ -196,10 +193,7 @@ def frames_by_timestep(clip: Clip) -> dict[int, dict[str, FrameKey]]:
 
 
 def facing_cameras(clip: Clip, atlas: MouthAtlas, count: int) -> list[str]:
-    """Ids of the ``count`` cameras that the mouth faces most, over poses spread along the clip.
-
-    Raises `InputError` if it faces none within 55 degrees.
-    """
+    """Ids of the ``count`` cameras that the mouth faces most, over poses spread along the clip."""
     timesteps = list(frames_by_timestep(clip))
     spread = evenly_with_ends(timesteps, 15)
     cosines: dict[str, list[float]] = {camera: [] for camera in clip.cameras}
