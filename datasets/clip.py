@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import cv2
 import numpy as np
 
 from ..bench.contracts import (
@@ -19,6 +20,7 @@ from ..bench.contracts import (
     FrameKey,
     HeadAsset,
     HeadPose,
+    IntArray,
     StepRecord,
 )
 from ..bench.errors import InputError
@@ -26,8 +28,102 @@ from ..bench.io.arrays import Member, check_arrays
 from ..bench.io.files import digest
 from ..bench.io.images import quantise
 from .head.arrays import OPTIONAL, STORED, HeadArrays
+from .head.model import PosedSubject
 from .images import ImageStore, read_image, read_mask
-from .region_masks import FOREGROUND, HeadRegions, select
+from .mesh_pictures import rasterize_mesh
+
+FOREGROUND = "foreground"
+PARTS: Mapping[str, tuple[str, ...]] = {
+    "face": ("face", "lips", "eye_region", "left_eyeball", "right_eyeball"),
+    "mouth": ("lips",),
+    "eyes": ("eye_region", "left_eyeball", "right_eyeball"),
+    "hair": ("scalp",),
+    "neck": ("neck", "boundary"),
+    "ears": ("left_ear", "right_ear"),
+}
+"""Regions of the head model that form each part; missing ones are skipped."""
+
+_NEEDED = {name: regions[0] for name, regions in PARTS.items()}
+_BITS = {name: 1 << bit for bit, name in enumerate((FOREGROUND, *PARTS))}
+
+
+class HeadRegions:
+    """The parts of one subject's head, for masks of frames. Thread-safe."""
+
+    def __init__(self, head: HeadArrays, shape: FloatArray, static_offset: FloatArray) -> None:
+        self._head, self._shape, self._offset = head, shape, static_offset
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parts that the head model has the regions for."""
+        return tuple(name for name in PARTS if _NEEDED[name] in self._head.regions)
+
+    def labels(self, camera: Camera, pose: HeadPose, mask: ByteArray | None) -> ByteArray:
+        """(H, W) 8-bit, one bit for each region that a pixel is in; see `select`.
+
+        ``mask`` is the (H, W) 8-bit coverage; with None nothing is foreground.
+        """
+        front = rasterize_mesh(self._subject.meshes([pose])[0], self._head.faces, camera).face
+        covered = front >= 0
+        labels = np.where(covered, self._bits_of_faces[np.maximum(front, 0)], 0).astype(np.uint8)
+        foreground = np.ones(front.shape, bool) if mask is None else mask >= 128
+        mouth = _hull(labels & _BITS["mouth"] != 0) & foreground
+        labels[mouth] |= _BITS["mouth"] | _BITS["face"]
+        if mask is not None:
+            labels[foreground] |= _BITS[FOREGROUND]
+            labels[_beyond(covered, labels & _BITS["hair"] != 0) & foreground] |= _BITS["hair"]
+        return labels
+
+    def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
+        """(H, W) distance of the mesh along the camera's axis, metres; infinity beside it."""
+        return rasterize_mesh(self._subject.meshes([pose])[0], self._head.faces, camera).depth
+
+    @cached_property
+    def _subject(self) -> PosedSubject:
+        return PosedSubject(self._head, self._shape, self._offset)
+
+    @cached_property
+    def _bits_of_faces(self) -> IntArray:
+        """(F,) bits of the parts that contain at least two corners of a triangle, so that seams have no gaps."""
+        regions, faces = self._head.regions, self._head.faces
+        bits = np.zeros(len(faces), dtype=np.uint8)
+        for name in self.names:
+            inside = np.zeros(len(self._head.template), dtype=bool)
+            for region in regions.keys() & set(PARTS[name]):
+                inside[regions[region]] = True
+            if name == "hair":
+                # The scalp of FLAME's masks runs into face and neck.
+                for region in regions.keys() & {"face", "neck"}:
+                    inside[regions[region]] = False
+            bits[inside[faces].sum(axis=1) >= 2] |= _BITS[name]
+        return bits
+
+
+def select(labels: ByteArray, name: str) -> BoolArray:
+    """(H, W) mask of one region from the bits of `HeadRegions.labels`."""
+    return (labels & _BITS[name]) != 0
+
+
+def _hull(seen: BoolArray) -> BoolArray:
+    """Fill the convex hull of some pixels."""
+    points = cv2.findNonZero(seen.astype(np.uint8))
+    if points is None:
+        return seen
+    filled = np.zeros(seen.shape, np.uint8)
+    cv2.fillConvexPoly(filled, cv2.convexHull(points), 1)
+    return filled != 0
+
+
+def _beyond(covered: BoolArray, part: BoolArray) -> BoolArray:
+    """Pixels that are not covered and whose nearest covered pixel is in a part."""
+    if not part.any():
+        return part
+    _, nearest = cv2.distanceTransformWithLabels(
+        (~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    is_part = np.zeros(int(nearest.max()) + 1, dtype=bool)
+    is_part[nearest[part]] = True
+    return np.asarray(is_part[nearest] & ~covered)
 
 
 class FrameFiles(NamedTuple):
@@ -54,24 +150,7 @@ PixelStep = Callable[[FrameKey, FramePixels], FramePixels]
 
 @dataclass(frozen=True, eq=False)
 class CaptureClip:
-    """A `Clip` whose images are read from disk on request.
-
-    Attributes
-    ----------
-    files : Mapping[FrameKey, FrameFiles]
-        Files of every frame, including excluded frames. Pixel steps change these pixels for methods.
-    source_fingerprint : str
-        Digest of the content of all files of the clip, independent of their location.
-    store : ImageStore
-        Decodes images and bounds their memory; shared by clips derived from one another.
-    pixel_steps : tuple[PixelStep, ...]
-        Steps applied in order when a frame is read, with one rounding to 8 bits at the end.
-    read_background : FloatArray | None
-        Colour that straight-alpha files are composited on before the pixel steps; None means
-        `background`.
-    source : Clip | None
-        The clip that gives the pixels of frames without files, see `as_capture`.
-    """
+    """A `Clip` whose images are read from disk on request."""
 
     subject: str
     head: HeadArrays
@@ -84,11 +163,17 @@ class CaptureClip:
     background: FloatArray
     steps: Sequence[StepRecord]
     files: Mapping[FrameKey, FrameFiles]
+    """Files of every frame, including excluded frames. Pixel steps change these pixels for methods."""
     source_fingerprint: str
+    """Digest of the content of all files of the clip, independent of their location."""
     store: ImageStore
+    """Decodes images and bounds their memory; shared by clips derived from one another."""
     pixel_steps: tuple[PixelStep, ...] = ()
+    """Steps applied in order when a frame is read, with one rounding to 8 bits at the end."""
     read_background: FloatArray | None = None
+    """Colour that straight-alpha files are composited on before the pixel steps; None means `background`."""
     source: Clip | None = None
+    """The clip that gives the pixels of frames without files, see `as_capture`."""
 
     @cached_property
     def frame_at(self) -> Mapping[tuple[int, str], FrameKey]:
@@ -239,8 +324,7 @@ def check_apart(clip: CaptureClip, out: Path) -> None:
 def as_capture(clip: Clip) -> CaptureClip:
     """Any clip as a `CaptureClip` for steps and commands; a `CaptureClip` is returned unchanged.
 
-    Pixels are read from ``clip``. Raises `InputError` if its head model is not in FLAME's layout, or the subject's
-    identity or a pose has another size.
+    Pixels are read from ``clip``.
     """
     if isinstance(clip, CaptureClip):
         return clip

@@ -10,10 +10,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..bench.contracts import ByteArray
+from ..bench.contracts import ByteArray, FloatArray
 from ..bench.errors import InputError
 from ..bench.io.files import write_bytes
 from ..bench.io.images import encode_image, probe_image, read_pixels
+
+
+def srgb_to_linear(values: FloatArray) -> FloatArray:
+    """Decode sRGB in [0, 1] (IEC 61966-2-1)."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
 
 _ROWS = 64
 
@@ -70,10 +76,7 @@ class ImageStore:
 
 
 def read_image(path: Path, background: Iterable[float]) -> ByteArray:
-    """Decode a PNG or JPEG to (H, W, 3) RGB, straight alpha composited on ``background`` and rounded.
-
-    Raises `InputError` as `read_pixels` does.
-    """
+    """Decode a PNG or JPEG to (H, W, 3) RGB, straight alpha composited on ``background`` and rounded."""
     pixels = read_pixels(path)
     if pixels.ndim == 2:
         return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB).astype(np.uint8, copy=False)
@@ -123,6 +126,6 @@ def is_whole(path: Path, width: int, height: int) -> bool:
 def write_image(path: Path, image: ByteArray, *options: int) -> None:
     """Write (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA, 8-bit, atomically; ``options`` are OpenCV's.
 
-    The suffix decides the format. Raises `InputError` as `encode_image` does.
+    The suffix decides the format.
     """
     write_bytes(path, encode_image(image, path.suffix, options, place=path))

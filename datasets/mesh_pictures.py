@@ -56,20 +56,11 @@ def draw_mesh(
 ) -> ByteArray:
     """Draw a shaded mesh; (H, W, 3) 8-bit sRGB of the camera's size.
 
-    Parameters
-    ----------
-    vertices : FloatArray
-        (V, 3) in the world, metres. Triangles with a non-finite corner are skipped.
-    faces : IntArray
-        (F, 3), counter-clockwise from outside; the inside is drawn too, darker.
-    colors : FloatArray | None
-        (V, 3) display-referred colours in [0, 1]; default: `CLAY`.
-    background : Sequence[float] | FloatArray | ByteArray
-        (3,) colour in [0, 1], or an (H, W, 3) image, 8-bit or in [0, 1], to draw on.
-    opacity : float
-        Opacity of the mesh over the background.
-    shading : float
-        1 for Lambert shading, 0 for the plain colours, or a mixture.
+    ``vertices``: (V, 3) in the world, metres. Triangles with a non-finite corner are skipped. ``faces``: (F, 3),
+    counter-clockwise from outside; the inside is drawn too, darker. ``colors``: (V, 3) display-referred colours in [0, 1];
+    default: `CLAY`. ``background``: (3,) colour in [0, 1], or an (H, W, 3) image, 8-bit or in [0, 1], to draw on.
+    ``opacity``: Opacity of the mesh over the background. ``shading``: 1 for Lambert shading, 0 for the plain colours, or a
+    mixture.
     """
     fine = camera.resized(supersampling * camera.width, supersampling * camera.height)
     fragments = rasterize_mesh(vertices, faces, fine)
@@ -140,17 +131,10 @@ def portrait_camera(
 ) -> Camera:
     """Place a camera in front of a head that looks along +z with +y up, so that all of it is visible.
 
-    Parameters
-    ----------
-    vertices : FloatArray
-        (V, 3) points that must be visible, metres; for pictures that are compared, all of their
-        vertices.
-    yaw, pitch : float
-        Radians; the camera moves to the head's left, and up.
-    fill : float
-        Fraction of the picture that the head's projection spans along its longer side.
-    distance : float
-        Distance from the middle of the vertices' bounding box, metres.
+    ``vertices``: (V, 3) points that must be visible, metres; for pictures that are compared, all of their vertices.
+    ``yaw``, ``pitch``: Radians; the camera moves to the head's left, and up. ``fill``: Fraction of the picture that the
+    head's projection spans along its longer side. ``distance``: Distance from the middle of the vertices' bounding box,
+    metres.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     outward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])

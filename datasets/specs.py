@@ -2,7 +2,7 @@
 
 from ..bench.specs import BenchmarkSpec, ConditionSpec, DatasetSpec
 
-ERRORS = "headbench.datasets.lint.before_run:errors"
+ERRORS = "headbench.datasets.lint.catalogue:errors"
 
 GA_LAYOUT = DatasetSpec(
     name="ga",
@@ -36,8 +36,8 @@ SYNTHETIC = DatasetSpec(
     summary="A ray-traced procedural head with exact tracking, written in the same layout.",
     implementation="headbench.datasets.synthetic.capture:synthesize",
     reads=False,
-    truth="headbench.datasets.synthetic.truth:SyntheticTruth",
-    needs="headbench.datasets.synthetic.needs:needs",
+    truth="headbench.datasets.synthetic.renderer:SyntheticTruth",
+    needs="headbench.datasets.synthetic.command:needs",
 )
 
 HEAD = BenchmarkSpec(
@@ -50,14 +50,14 @@ TRACKED = ConditionSpec(
     name="tracked",
     summary="Clip: tracking estimated from images, as by `track`; parameters landmarks, embedding, seed.",
     kind="clip",
-    implementation="headbench.datasets.tracked_clip:with_tracking",
+    implementation="headbench.datasets.tracking.track:with_tracking",
 )
 
 RIGID_HEAD = ConditionSpec(
     name="rigid-head",
     summary="Clip: the rotation of the neck moved into the motion of the head, as in trackers without a neck joint.",
     kind="clip",
-    implementation="headbench.datasets.steps.rigid:as_rigid_head",
+    implementation="headbench.datasets.steps.rest:as_rigid_head",
 )
 
 REST_EXPRESSION = ConditionSpec(
@@ -71,5 +71,5 @@ PACKED_CHART = ConditionSpec(
     name="packed-chart",
     summary="Clip: texture coordinates for a head model without any, with a separate area for every triangle.",
     kind="clip",
-    implementation="headbench.datasets.steps.charted:with_packed_chart",
+    implementation="headbench.datasets.steps.rest:with_packed_chart",
 )

@@ -72,7 +72,7 @@ class TruthPictures:
         clip = job.form.clip
         place = f"truth of {clip.fingerprint}"
         if place not in job.kept:
-            from ...datasets.synthetic.truth import SyntheticTruth  # imports torch
+            from ...datasets.synthetic.renderer import SyntheticTruth
 
             job.kept[place] = SyntheticTruth(clip)
         return cls(job.kept[place], job.run / FOLDER, next(iter(job.clip.cameras.values())).height)

@@ -55,10 +55,10 @@ MARKER = "headbench-export.json"
 def export_colmap(settings: ExportColmapSettings, progress: Progress) -> CommandResult:
     """Write frames of a capture as a COLMAP dataset: images, masks, sparse model.
 
-    See `export_model`. Raises `InputError` for timesteps that the capture lacks.
+    See `export_model`.
     """
     from ..clip import check_apart
-    from .writer import export_model, export_tracking
+    from .reader import export_model, export_tracking
 
     clip = settings.open(settings.capture, progress)
     out = Path(settings.out)

@@ -36,8 +36,8 @@ from ...bench.specs import CommandResult, command
 from ..clip import CaptureClip, FrameFiles, without_images
 from ..ga.writer import CANONICAL_JAW, CapturePlan, CaptureWriter, SequencePlan
 from ..head.arrays import JOINT_NAMES, HeadArrays, read_head
+from ..head.model import PosedSubject, pose_in_head_frame, resting
 from ..head.refit.identity import FACE
-from ..head.subject import PosedSubject, pose_in_head_frame, resting
 from ..mesh_pictures import portrait_camera
 from ..video.decode import SUFFIXES
 from .formats import read_signal
@@ -53,18 +53,12 @@ SEQUENCE = "drive"
 
 @dataclass(frozen=True, eq=False)
 class AvatarScene:
-    """An avatar's subject before a camera.
-
-    Attributes
-    ----------
-    clip : CaptureClip
-        Clip of the subject with one camera; its poses are replaced.
-    rest : RigidMean
-        Head pose at rest.
-    """
+    """An avatar's subject before a camera."""
 
     clip: CaptureClip
+    """Clip of the subject with one camera; its poses are replaced."""
     rest: RigidMean
+    """Head pose at rest."""
 
     @property
     def head(self) -> HeadArrays:
@@ -90,10 +84,7 @@ class AvatarScene:
 
 
 def make_scene(settings: DriveSettings, stored: StoredAvatar, progress: Progress) -> AvatarScene:
-    """The scene of the settings: in the capture that is named, else in front of the avatar's own head.
-
-    Raises `InputError` for an avatar that has no head model file and no capture, and for a capture of another subject.
-    """
+    """The scene of the settings: in the capture that is named, else in front of the avatar's own head."""
     if settings.capture:
         clip = settings.open(settings.capture, progress)
         stored.check_subject(clip)
@@ -213,12 +204,7 @@ _JAW = JOINT_NAMES.index("jaw")
 class DrivenMeasures:
     """Measures on the vertices of one subject.
 
-    Parameters
-    ----------
-    shape : FloatArray
-        (S,) identity of the avatar.
-    static_offset : FloatArray
-        (V, 3) metres.
+    ``shape``: (S,) identity of the avatar. ``static_offset``: (V, 3) metres.
     """
 
     def __init__(self, head: HeadArrays, shape: FloatArray, static_offset: FloatArray):
@@ -281,10 +267,7 @@ RESULT_FILE = "drive.json"
 
 @command("drive", group="inspect")
 def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> CommandResult:
-    """Drive a stored avatar with any signal: coefficients, blendshapes, FLAME parameters, a capture.
-
-    Raises `InputError` before any rendering for an avatar, a signal, a map or a capture that cannot be read or do not fit.
-    """
+    """Drive a stored avatar with any signal: coefficients, blendshapes, FLAME parameters, a capture."""
     out = Path(settings.out)
     is_video = out.suffix.lower() in ENCODINGS
     with ExitStack() as stack:

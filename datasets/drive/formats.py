@@ -29,10 +29,19 @@ from ...bench.registry import finds, readers, unknown
 from ..ga.layout import Declaration
 from ..ga.tracking import POSE_SIZES, find_head, read_animation, read_tracking
 from ..head.arrays import HeadArrays
-from .blendshapes import ARKIT, apply_blendshapes, is_blendshapes, read_blendshapes
-from .names import IDENTITY, NAMES
-from .signal import AVATAR, NO_EYELIDS, POSE_PARTS, DrivingSignal, SignalRequest, make_poses
-from .table import SignalTable, read_table
+from .signal import (
+    ARKIT,
+    AVATAR,
+    NO_EYELIDS,
+    POSE_PARTS,
+    DrivingSignal,
+    SignalRequest,
+    apply_blendshapes,
+    is_blendshapes,
+    make_poses,
+    read_blendshapes,
+)
+from .table import IDENTITY, NAMES, SignalTable, read_table
 from .timing import Timing, in_order
 
 TRACKED_HEAD = "flame2023"
@@ -72,10 +81,7 @@ def read_flame_parameters(request: SignalRequest) -> DrivingSignal:
 
 
 def read_capture_signal(request: SignalRequest) -> DrivingSignal:
-    """Poses of one sequence of a capture of any layout, without excluded frames, in the order of time.
-
-    Raises `InputError` for an unknown sequence, and for none where the capture has several.
-    """
+    """Poses of one sequence of a capture of any layout, without excluded frames, in the order of time."""
     head = request.signal_head if request.signal_head != AVATAR else ""
     if head and not Path(head).exists():
         expected = "the file of a head model, for a signal that is a capture"
@@ -163,11 +169,7 @@ _COMPONENT = re.compile(r"([a-z]+)\.(\d+)")
 
 
 def read_mapped(request: SignalRequest) -> DrivingSignal:
-    """Poses of a table by the map file of the request, ``{column: {coefficient: weight}}``.
-
-    Raises `InputError` for a map with a column that the table lacks, with an unknown coefficient, or with ARKit's names beside
-    coefficients, which are of another head.
-    """
+    """Poses of a table by the map file of the request, ``{column: {coefficient: weight}}``."""
     table, source = request.columns, Path(request.map)
     content = {str(name): entry for name, entry in read_yaml(source).items()}
     weights = checked(content, dict[str, dict[str, float]], source)
@@ -219,22 +221,15 @@ def _coefficients(source: Path, head: HeadArrays, sums: Mapping[str, FloatArray]
 
 @dataclass(frozen=True)
 class SignalFormat:
-    """A format of driving signals.
-
-    Attributes
-    ----------
-    name, summary : str
-        Name for ``--form``, and a description.
-    fits : Callable[[SignalTable], bool]
-        Whether a table without a map is of this format.
-    read : Callable[[SignalRequest], DrivingSignal]
-        Reader; its errors are `InputError`.
-    """
+    """A format of driving signals."""
 
     name: str
     summary: str
+    """Name for ``--form``, and a description."""
     fits: Callable[[SignalTable], bool]
+    """Whether a table without a map is of this format."""
     read: Callable[[SignalRequest], DrivingSignal]
+    """Reader; its errors are `InputError`."""
 
 
 FORMATS = (

@@ -21,9 +21,34 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy, read_npz
 from ...bench.io.documents import parse_json, read_text, shown
 from ...bench.io.files import reading, user_files
-from ..foreign import describe
-from .names import IDENTITY, NAMES
+from ..open import describe
 from .timing import Timing, from_columns, in_order, is_empty
+
+NAMES: Mapping[str, tuple[str, ...]] = {
+    "expression": ("expression", "expression_params", "exp", "expcode", "expr"),
+    "jaw": ("jaw", "jaw_pose", "jaw_params", "jawpose"),
+    "rotation": ("rotation", "pose_params", "torso_pose", "global_pose", "globalpose"),
+    "neck": ("neck", "neck_pose"),
+    "eyes": ("eyes", "eyes_pose", "eye_pose"),
+    "left_eye": ("eye_l_pose",),
+    "right_eye": ("eye_r_pose",),
+    "eyelids": ("eyelids", "eyelid_params"),
+    "translation": ("translation",),
+    "pose": ("pose", "posecode"),
+}
+"""Names of the arrays by part; ``pose`` is rotation, then jaw, of DECA and EMOCA. The first name that is found counts."""
+
+IDENTITY = (
+    "shape",
+    "shapecode",
+    "shape_params",
+    "shape_from_facenet",
+    "static_offset",
+    "dynamic_offset",
+    "betas",
+)
+"""Names of arrays of the subject, of any length."""
+
 
 _CATEGORY_NAMES, _SCORE = ("categoryName", "category_name"), "score"
 """Keys of MediaPipe's categories in its JavaScript, Java and C#, and in its Python."""
@@ -46,24 +71,16 @@ _FRAMES = "frames"
 
 @dataclass(frozen=True, eq=False)
 class SignalTable:
-    """Columns of a signal, not yet checked: each is converted when it is used.
-
-    Attributes
-    ----------
-    path : Path
-        File or folder, named in errors.
-    columns : Mapping[str, Sequence[Any] | np.ndarray]
-        T values by name: numbers, text, lists of numbers, or an array (T, ...).
-    places : Sequence[str]
-        Location of each of the T frames in the file, such as "line 7".
-    timing : Timing
-        Times of the T frames.
-    """
+    """Columns of a signal, not yet checked: each is converted when it is used."""
 
     path: Path
+    """File or folder, named in errors."""
     columns: Mapping[str, Sequence[Any] | np.ndarray]
+    """T values by name: numbers, text, lists of numbers, or an array (T, ...)."""
     places: Sequence[str]
+    """Location of each of the T frames in the file, such as "line 7"."""
     timing: Timing
+    """Times of the T frames."""
 
     def __len__(self) -> int:
         return len(self.places)
@@ -117,7 +134,7 @@ class SignalTable:
         return values
 
     def single(self, name: str) -> FloatArray:
-        """(T,) values of a column with one number a frame. Raises `InputError` for more, and as `values`."""
+        """(T,) values of a column with one number a frame."""
         found = self.values(name)
         if found.shape[1] != 1:
             raise InputError(self.path, name, "one number a frame", str(found.shape[1]))
@@ -148,8 +165,6 @@ def read_table(path: Path, fps: float | None = None) -> SignalTable:
     """Read a file by its ending, or a folder with files of each frame. Times are those of a column, if there are any.
 
     With ``fps``, frames per second, a column of times that gives no rate is no error.
-
-    Raises `InputError` for another ending, a damaged or empty file, and frames with unequal columns.
     """
     read = _folder if path.is_dir() else _READERS.get(path.suffix.lower())
     if read is None:
@@ -180,10 +195,7 @@ def _without_nan(text: str) -> str:
 
 
 def _expanded(frame: Mapping[str, Any], path: Path, place: str, names: Sequence[str] = ()) -> dict[str, Any]:
-    """Columns of a frame, also of objects in it, with one for each of MediaPipe's categories or of the ``names`` of weights.
-
-    Raises `InputError` for two faces.
-    """
+    """Columns of a frame, also of objects in it, with one for each of MediaPipe's categories or of the ``names`` of weights."""
     line: dict[str, Any] = {}
     for name, value in frame.items():
         faces = value if isinstance(value, list) else [value]
@@ -205,7 +217,7 @@ def _expanded(frame: Mapping[str, Any], path: Path, place: str, names: Sequence[
 
 
 def _weights(row: Any, path: Path, place: str, names: Sequence[str]) -> dict[str, Any]:
-    """Values by name of a row of weights; none of an empty row. Raises `InputError` for another number of them."""
+    """Values by name of a row of weights; none of an empty row."""
     if not is_empty(row) and not (isinstance(row, list) and len(row) == len(names)):
         found = str(len(row)) if isinstance(row, list) else shown(row)
         raise InputError(path, place, f"{len(names)} values a row, as there are names", found)
@@ -290,7 +302,7 @@ def _named(document: Mapping[str, Any], keys: Sequence[str], kind: type) -> Any:
 
 
 def _rate(path: Path, document: Mapping[str, Any]) -> float | None:
-    """Frames per second that a document states. Raises `InputError` for none from 1 to `MOST_FPS`."""
+    """Frames per second that a document states."""
     for key, value in document.items():
         value = value[0] if isinstance(value, list) and len(value) == 1 else value
         if key.lower().replace("_", "") in _RATES and not is_empty(value) and not isinstance(value, list):

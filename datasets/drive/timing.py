@@ -39,24 +39,16 @@ ONE_FACE = "If these are two faces of one frame, keep those of one face."
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """When the frames of a signal were recorded.
-
-    Attributes
-    ----------
-    positions : FloatArray
-        (T,) increasing times of the frames, in frames since the first; a gap is a step above 1.
-    last : float
-        Time of the last frame of the signal; those at its ends may lack a face and a position.
-    fps : float | None
-        Frames per second, if the signal states them.
-    column : str
-        Column of a table that states the times, or "".
-    """
+    """When the frames of a signal were recorded."""
 
     positions: FloatArray
+    """(T,) increasing times of the frames, in frames since the first; a gap is a step above 1."""
     last: float
+    """Time of the last frame of the signal; those at its ends may lack a face and a position."""
     fps: float | None = None
+    """Frames per second, if the signal states them."""
     column: str = ""
+    """Column of a table that states the times, or ""."""
 
     @classmethod
     def regular(cls, count: int, fps: float | None = None) -> Timing:
@@ -97,8 +89,7 @@ def natural_order(path: Path) -> list[tuple[bool, int | str]]:
 def in_order(paths: Sequence[Path]) -> tuple[list[Path], Timing]:
     """Files or folders of one frame each by the number of the frame in their names, and their times.
 
-    The frame's is the first number that varies; some or all names may have a second, such as a face's. Raises `InputError` for
-    two of one frame.
+    The frame's is the first number that varies; some or all names may have a second, such as a face's.
     """
     paths = sorted(paths, key=natural_order)
     numbers = [[int(part) for part in re.findall(r"\d+", path.stem)] for path in paths]
@@ -128,10 +119,7 @@ def is_empty(value: Any) -> bool:
 def from_columns(
     path: Path, columns: Mapping[str, Any], places: Sequence[str], has_rate: bool
 ) -> Timing | None:
-    """Times by a column of times, or of frame numbers; None without one. Times without a value are interpolated.
-
-    Raises `InputError` for times that do not increase, and for those that give no usual rate unless another is known.
-    """
+    """Times by a column of times, or of frame numbers; None without one. Times without a value are interpolated."""
     found: tuple[str, list[int], FloatArray] | None = None
     unread = ""
     for pattern, parsed in ((_TIME, _seconds), (_NUMBER, _numbers)):

@@ -10,18 +10,20 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import savgol_filter
 
-from ...bench.contracts import FloatArray, FrameKey, HeadPose, Progress, no_progress
+from ...bench.contracts import FloatArray, FrameKey, HeadAsset, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.experiments.reenactment import AT_ORIGIN, RigidMean, retarget
 from ..clip import CaptureClip, FrameFiles, without_images
 from ..head.arrays import HeadArrays
+from ..head.model import PosedSubject, resting
 from ..head.refit.identity import match
 from ..head.refit.refit import BlockFitter, refit
 from ..head.refit.settings import RefitSettings
 from ..head.rotations import rotation_of
-from ..head.subject import PosedSubject, resting
 from ..head.teeth import with_teeth_where_possible
-from .signal import NO_EYELIDS, DrivingSignal
+from .formats import read_rows
+from .signal import NO_EYELIDS, DrivingSignal, SignalRequest
+from .table import SignalTable, parse_line
 from .timing import GAP, Timing
 
 SMOOTHED = ("expression", "jaw", "eyes", "eyelids", "neck", "rotation", "translation")
@@ -50,10 +52,7 @@ def transfer(
 ) -> Transferred:
     """Bring a signal to a head model by `refit`, on the vertices of the signal's mean head, so that no identity is transferred.
 
-    Parameters
-    ----------
-    neutral : int | None
-        Frame of the signal with the neutral face; None takes the neutral face of the signal's head model.
+    ``neutral``: Frame of the signal with the neutral face; None takes the neutral face of the signal's head model.
     """
     poses = list(signal.poses)
     if neutral is not None and neutral >= len(poses):
@@ -82,10 +81,7 @@ def transfer(
 class FrameTransfer:
     """`transfer` frame by frame, for live signals.
 
-    Parameters
-    ----------
-    source, target : HeadArrays
-        Head models of the signal and of the avatar.
+    ``source``, ``target``: Head models of the signal and of the avatar.
     """
 
     def __init__(self, source: HeadArrays, target: HeadArrays):
@@ -164,8 +160,8 @@ def resampled(
 ) -> tuple[list[HeadPose], list[tuple[int, int]]]:
     """Poses at ``fps``, and the first and last number of each series of them that no frame of the signal is near to.
 
-    Between two frames poses are interpolated linearly, head rotations on the shortest path; before the first and after the last
-    they are held. Signals that state no rate have ``fps``. Raises `InputError` for a signal without half of its frames.
+    Between two frames poses are interpolated linearly, head rotations on the shortest path; before the first and after the
+    last they are held. Signals that state no rate have ``fps``.
     """
     positions, total = timing.positions, round(timing.last) + 1
     if 2 * len(positions) < total:
@@ -201,10 +197,7 @@ def resampled(
 
 
 def window_length(frames: int, seconds: float, fps: float) -> int:
-    """Odd number of frames of a window of ``seconds``; 0 for no window.
-
-    Raises `InputError` for a window that is too short to smooth, or longer than the signal.
-    """
+    """Odd number of frames of a window of ``seconds``; 0 for no window."""
     if not seconds:
         return 0
     window = 2 * round((seconds * fps - 1) / 2) + 1
@@ -220,8 +213,6 @@ def smoothed(poses: Sequence[HeadPose], seconds: float, fps: float) -> list[Head
 
     Savitzky and Golay, "Smoothing and differentiation of data by simplified least squares procedures", Anal. Chem. 36, 1964,
     by `scipy.signal.savgol_filter`. The window has the odd number of frames nearest to ``seconds``.
-
-    Raises `InputError` as `window_length`.
     """
     if not seconds:
         return list(poses)
@@ -247,3 +238,39 @@ def _eyelids(pose: HeadPose, target: HeadArrays) -> FloatArray | None:
     if target.eyelid_basis is None:
         return None
     return np.zeros(target.eyelid_basis.shape[2]) if pose.eyelids is None else pose.eyelids
+
+
+class LiveDriver:
+    """Converts lines of one frame each (coefficients or blendshapes, as for `read_signal`) to poses of a head model.
+
+    ``target``: Head model of the avatar. ``signal_head``: See `settings.DriveSettings`.
+    """
+
+    def __init__(self, target: HeadAsset, signal_head: str = ""):
+        if not isinstance(target, HeadArrays):
+            raise InputError(
+                "avatar", "head", "a head model of headbench's own arrays", type(target).__name__
+            )
+        self._target, self._signal_head = target, signal_head
+        if signal_head:
+            SignalRequest(
+                Path("live signal"), target, signal_head=signal_head
+            ).head()  # Raises for a file that cannot be read.
+        self._transfer: dict[str, FrameTransfer] = {}
+        self._first: RigidMean | None = None
+
+    def __call__(self, line: str) -> HeadPose:
+        """The pose of a line; the head moves around the origin, relative to the first line."""
+        path = Path("live signal")
+        frame = parse_line(line, path, "line")
+        if not frame:
+            raise InputError(path, "line", "values of a frame with a face", "none")
+        columns = {name: [value] for name, value in frame.items()}
+        table = SignalTable(path, columns, ["line"], Timing.regular(1))
+        signal = read_rows(SignalRequest(path, self._target, table, self._signal_head))
+        version = signal.head.version
+        if version not in self._transfer:
+            self._transfer[version] = FrameTransfer(signal.head, self._target)
+        pose = self._transfer[version](signal.poses[0])
+        self._first = self._first or RigidMean.of([pose])
+        return retarget(pose, self._first, AT_ORIGIN, pose.subject)

@@ -9,16 +9,24 @@ sequences must be moved accordingly.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
+import cv2
 import numpy as np
 
-from ...bench.contracts import Camera, FloatArray
+from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, IntArray
 from ...bench.errors import InputError
 from ...bench.io.images import ImageInfo
+from ...bench.protocol import evenly_with_ends
+from ..head.geometry import project
+from ..head.model import PosedSubject
+from ..images import read_image, read_mask
 from .layout import CyConvention, extrinsics_from_json, intrinsics_from_json
+from .tracking import Tracking
 from .transforms import FrameEntry
 
 ROTATION_TOLERANCE = 1e-5
@@ -28,21 +36,14 @@ FOCAL_TOLERANCE = 0.01  # relative, between fl_x and camera_angle_x
 
 @dataclass(frozen=True, eq=False)
 class CaptureCameras:
-    """Cameras of a capture and the shift of each sequence.
-
-    Attributes
-    ----------
-    views : Mapping[str, FrameEntry]
-        Representative frame entry by camera id, in the first sequence's world.
-    sizes : Mapping[str, tuple[int, int]]
-        (width, height) by camera id.
-    shifts : Mapping[str, FloatArray]
-        (3,) metres to add to positions of a sequence, by sequence folder; zero for the first.
-    """
+    """Cameras of a capture and the shift of each sequence."""
 
     views: Mapping[str, FrameEntry]
+    """Representative frame entry by camera id, in the first sequence's world."""
     sizes: Mapping[str, tuple[int, int]]
+    """(width, height) by camera id."""
     shifts: Mapping[str, FloatArray]
+    """(3,) metres to add to positions of a sequence, by sequence folder; zero for the first."""
 
     def resolve(self, cy: CyConvention) -> dict[str, Camera]:
         """`Camera` by id, with the given convention of the principal point."""
@@ -66,11 +67,7 @@ class CaptureCameras:
 
 
 def collect_cameras(entries: Sequence[FrameEntry], infos: Mapping[Path, ImageInfo]) -> CaptureCameras:
-    """Gather the cameras of all frames.
-
-    Raises `InputError` if a camera moves or changes within a sequence, sequences differ by more than a translation, or
-    ``camera_index`` and ``camera_id`` do not match.
-    """
+    """Gather the cameras of all frames."""
     _check_ids(entries)
     sizes = {entry.image: (infos[entry.image].width, infos[entry.image].height) for entry in entries}
     groups: dict[str, dict[str, FrameEntry]] = {}
@@ -170,3 +167,158 @@ def _check_focal(entry: FrameEntry, width: int) -> None:
         remedy = "The intrinsics were probably not scaled with the images."
         found = f"{entry.intrinsics['fl_x']:.6g}"
         raise InputError(entry.file, f"{entry.where}.fl_x", expected, found, remedy)
+
+
+OUTLINE_SIGMA = 0.004
+"""Tolerance of the agreement of outlines, as a fraction of the image height."""
+
+MARGIN = 0.05
+"""Minimum relative difference between the two agreements for a decision."""
+
+VOTES = 0.75
+"""Minimum fraction of the frames with the same result."""
+
+FRAMES = 24
+"""Frames to judge by."""
+
+FOREGROUND_LEVELS = 8
+"""Minimum difference from the background of foreground pixels without a mask, 8-bit levels."""
+
+_SUBPIXEL_BITS = 4
+
+
+@dataclass(frozen=True)
+class CyEvidence:
+    """Agreement of outlines for each convention, means over frames in [0, 1], and the fraction of frames in favour of
+    the top. ``decision`` is None without a clear result."""
+
+    top: float
+    bottom: float
+    votes_for_top: float
+
+    @property
+    def decision(self) -> Literal["top", "bottom"] | None:
+        best = max(self.top, self.bottom)
+        if best <= 0 or abs(self.top - self.bottom) < MARGIN * best:
+            return None
+        if self.top > self.bottom:
+            return "top" if self.votes_for_top >= VOTES else None
+        return "bottom" if self.votes_for_top <= 1 - VOTES else None
+
+
+@dataclass(frozen=True, eq=False)
+class OutlineView:
+    """A sample frame: the posed mesh (V, 3) in the world, the camera with cy from the top, the mask."""
+
+    vertices: FloatArray
+    camera: Camera
+    mask: Callable[[], ByteArray]
+
+
+def settle_cy(
+    folder: Path,
+    asked: CyConvention | Literal["auto"],
+    declared: CyConvention | None,
+    rig: CaptureCameras,
+    tracking: Tracking,
+    poses: Mapping[int, HeadPose],
+    entries: Sequence[FrameEntry],
+    background: Sequence[float],
+) -> tuple[CyConvention, dict[str, Any]]:
+    """Choose the convention of ``cy``: as requested, else as declared, else inferred from the images.
+
+    Returns the convention and its reason, for the step record. Raises `InputError` if it makes a difference (some |cy
+    - h/2| > 0.5 px) and the images are inconclusive.
+    """
+    if asked != "auto":
+        return asked, {"source": "argument"}
+    if declared is not None:
+        return declared, {"source": "declaration"}
+    if not rig.cy_matters():
+        return "top", {"source": "immaterial, within 0.5 px of the centre"}
+    evidence = weigh_cy(_pick_views(rig, tracking, poses, entries, background), tracking.head.faces)
+    if evidence.decision is None:
+        expected = "outlines of the tracked mesh and the foreground that agree better under one reading of cy"
+        found = f"agreement {evidence.top:.3f} with cy from the top, {evidence.bottom:.3f} from the bottom"
+        remedy = (
+            'State the convention: cy="bottom" for VHAP exports since November 2024, "top" for older ones, '
+            '"centre" to ignore the principal point as GaussianAvatars does.'
+        )
+        raise InputError(folder, "cy", expected, found, remedy)
+    return evidence.decision, {"source": "outlines", **asdict(evidence)}
+
+
+def _pick_views(
+    rig: CaptureCameras,
+    tracking: Tracking,
+    poses: Mapping[int, HeadPose],
+    entries: Sequence[FrameEntry],
+    background: Sequence[float],
+) -> list[OutlineView]:
+    """Up to `FRAMES` frames, spread over timesteps and cameras (by a stride coprime to most rig sizes)."""
+    cameras = rig.resolve("top")
+    ordered = sorted(entries, key=lambda e: (e.timestep, e.camera_index))
+    chosen = evenly_with_ends(ordered, FRAMES)
+    subject = PosedSubject(tracking.head, tracking.shape, tracking.static_offset)
+    return [
+        OutlineView(mesh, cameras[entry.camera_id], partial(_foreground, entry, background))
+        for entry, mesh in zip(chosen, subject.meshes([poses[entry.timestep] for entry in chosen]))
+    ]
+
+
+def _foreground(entry: FrameEntry, background: Sequence[float]) -> ByteArray:
+    """The frame's mask, or without one the pixels that differ from the background."""
+    if entry.mask is not None:
+        return read_mask(entry.mask)
+    levels = np.round(np.asarray(background) * 255)
+    different = np.abs(read_image(entry.image, background) - levels).max(axis=2) > FOREGROUND_LEVELS
+    return (different * 255).astype(np.uint8)
+
+
+def weigh_cy(views: Sequence[OutlineView], faces: IntArray) -> CyEvidence:
+    """Compare both conventions of ``cy`` over some frames.
+
+    For each frame: the mesh is projected and filled; agreement is the mean over its outline's pixels of
+    exp(-(d / sigma)^2) with d the distance to the foreground's outline. The image border is not part of the outline.
+    """
+    top, bottom = [], []
+    for view in views:
+        foreground = (view.mask() > 127).astype(np.uint8)
+        distance = _distance_to_outline(foreground)
+        flipped = view.camera.height - 2 * float(view.camera.K[1, 2])
+        projected = project(view.vertices, view.camera)
+        top.append(_agreement(projected, faces, distance))
+        bottom.append(_agreement(projected + np.array([0.0, flipped]), faces, distance))
+    favour = np.sign(np.array(top) - np.array(bottom))
+    return CyEvidence(float(np.mean(top)), float(np.mean(bottom)), float(np.mean((favour + 1) / 2)))
+
+
+def _agreement(pixels: FloatArray, faces: IntArray, distance: FloatArray) -> float:
+    height, width = distance.shape
+    filled = np.zeros((height, width), dtype=np.uint8)
+    # Pixel centres are at half-integers here and at integers in OpenCV.
+    corners = np.round((pixels - 0.5) * 2**_SUBPIXEL_BITS).astype(np.int32)
+    limit = 2**20  # far outside any image, near enough for fixed-point arithmetic
+    triangles = np.clip(corners, -limit, limit)[faces]
+    for triangle in triangles:
+        cv2.fillConvexPoly(filled, triangle, 1, shift=_SUBPIXEL_BITS)
+    outline = _outline(filled)
+    if not outline.any():
+        return 0.0
+    scale = max(1.0, OUTLINE_SIGMA * height)
+    return float(np.exp(-((distance[outline] / scale) ** 2)).mean())
+
+
+def _outline(filled: ByteArray) -> np.ndarray:
+    """Pixels of a filled shape next to unfilled ones; none where the image border cuts the shape."""
+    eroded = cv2.erode(filled, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    return (filled > 0) & (eroded == 0)
+
+
+def _distance_to_outline(foreground: ByteArray) -> FloatArray:
+    """(H, W) distance in pixels to the foreground's outline; a large value everywhere without one."""
+    outline = _outline(foreground)
+    if not outline.any():
+        return np.full(foreground.shape, np.inf)
+    distance = cv2.distanceTransform((~outline).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return distance.astype(np.float64)

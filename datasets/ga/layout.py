@@ -31,7 +31,7 @@ from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.documents import checked, read_json, shown
 from ...bench.io.files import check_name, json_text, with_slashes, write_json
-from ..rounding import ANGLE_BITS, on_grid
+from ..head.geometry import ANGLE_BITS, on_grid
 
 CyConvention = Literal["top", "bottom", "centre"]
 """Convention of the principal point: ``cy`` from the top edge, from the bottom edge, or the image centre instead of
@@ -135,35 +135,24 @@ def extrinsics_from_json(transform_matrix: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Declaration:
-    """``headbench.json``: properties that the layout does not define.
-
-    Attributes
-    ----------
-    head_model : str
-        Version of the head model of the parameters.
-    head_file : str
-        Head model file, relative to the declaration's folder.
-    background : tuple[float, float, float]
-        (r, g, b) in [0, 1] that the images are composited on.
-    cy : CyConvention
-        Convention of the JSONs' principal point.
-    excluded : Mapping[int, str]
-        Reason by timestep index of the folder's JSONs, for frames excluded from all splits.
-    synthetic : Mapping[str, Any]
-        How the capture was synthesised; empty for a recording.
-    cut : str
-        What was replaced by background below the head: "bust-line", "parsing", or "" if nothing is known of it.
-    """
+    """``headbench.json``: properties that the layout does not define."""
 
     subject: str
     head_model: str
+    """Version of the head model of the parameters."""
     head_file: str = HEAD_FILE
+    """Head model file, relative to the declaration's folder."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """(r, g, b) in [0, 1] that the images are composited on."""
     cy: CyConvention = "bottom"
+    """Convention of the JSONs' principal point."""
     sequences: Mapping[str, str] = field(default_factory=dict)
     excluded: Mapping[int, str] = field(default_factory=dict)
+    """Reason by timestep index of the folder's JSONs, for frames excluded from all splits."""
     synthetic: Mapping[str, Any] = field(default_factory=dict)
+    """How the capture was synthesised; empty for a recording."""
     cut: str = ""
+    """What was replaced by background below the head: "bust-line", "parsing", or "" if nothing is known of it."""
 
     def write(self, folder: Path) -> None:
         """Write ``headbench.json`` into ``folder``."""

@@ -20,15 +20,13 @@ from ...bench.errors import InputError
 from ...bench.io.files import check_name, digest
 from ...bench.io.images import ImageInfo
 from ..clip import CaptureClip, FrameFiles
-from ..foreign import MONOCULAR, describe
 from ..head.arrays import HeadArrays, in_memory
 from ..images import ImageStore
+from ..open import MONOCULAR, describe
 from ..steps.exclude import exclude_given, exclude_timesteps
 from ..steps.masks import check_colour, mask_below_neck, set_background
 from . import layout
-from .cameras import CaptureCameras, collect_cameras
-from .content_digests import digests_below
-from .principal_point import settle_cy
+from .cameras import CaptureCameras, collect_cameras, settle_cy
 from .tracking import TeethPolicy, Tracking, check_version, read_head_model, read_tracking
 from .transforms import RAISED, Faults, FrameEntry, read_transforms
 from .validate import (
@@ -37,6 +35,7 @@ from .validate import (
     check_images,
     check_leaks,
     check_timesteps,
+    digests_below,
     find_leaks,
     sequence_names,
     split_by_holding_out,
@@ -174,10 +173,7 @@ def read_content(
     If ``faults`` collects them, the first one is the error that `read_capture` raises, and the rest is read as far as
     possible.
 
-    Parameters
-    ----------
-    resplit : bool
-        Whether splits are not those of the JSONs.
+    ``resplit``: Whether splits are not those of the JSONs.
     """
     declaration, asset, rig = None, None, None
     with faults.of("declaration"):
@@ -274,10 +270,7 @@ def build_clip(
 
 
 def find_captures(root: Path) -> list[Path]:
-    """Captures under ``root``: the folder itself if it holds transforms JSONs, else its union folders.
-
-    Raises `InputError` if there is none, with the format found and a conversion to a capture.
-    """
+    """Captures under ``root``: the folder itself if it holds transforms JSONs, else its union folders."""
     expected = "a folder with a capture in the GaussianAvatars/VHAP layout"
     if not root.exists():
         raise InputError(root, "", expected, "no such folder")
@@ -294,7 +287,7 @@ def find_captures(root: Path) -> list[Path]:
 
 
 def find_capture(path: str | Path) -> Path:
-    """The only capture at ``path``. Raises `InputError` if there is none or several."""
+    """The only capture at ``path``."""
     folder = Path(os.path.realpath(path))  # neither "." nor a link names a subject or sequence
     captures = find_captures(folder)
     if len(captures) != 1:
@@ -305,10 +298,7 @@ def find_capture(path: str | Path) -> Path:
 
 
 def listed_frames(path: str | Path) -> dict[str, list[tuple[int, str]]]:
-    """Timestep and camera of every frame of ``transforms_{train,val,test}.json``, in their order.
-
-    Raises `InputError` as `read_transforms` does.
-    """
+    """Timestep and camera of every frame of ``transforms_{train,val,test}.json``, in their order."""
     files = (find_capture(path) / file for file in layout.SPLIT_FILES.values())
     listed = {file.stem: read_transforms(file) for file in files if file.exists()}
     return {
@@ -318,7 +308,7 @@ def listed_frames(path: str | Path) -> dict[str, list[tuple[int, str]]]:
 
 
 def pose_files(path: str | Path) -> dict[int, Path]:
-    """The ``flame_param`` file of every timestep of a capture. Raises `InputError` as `read_transforms` does."""
+    """The ``flame_param`` file of every timestep of a capture."""
     folder = find_capture(path)
     files = [folder / file for file in layout.SPLIT_FILES.values() if (folder / file).exists()]
     entries = [

@@ -36,14 +36,9 @@ def find_head(
 ) -> HeadArrays:
     """Head model of a capture, of the declared version.
 
-    Parameters
-    ----------
-    head : HeadArrays | str | Path | None
-        The head model or its file; None takes the file that ``headbench.json`` names, else the
-        capture's ``head_model.npz``.
-    files : str | Path | None
-        Arguments masks, regions and eyelids of `load_head`, which finds them by itself beside a FLAME
-        pickle.
+    ``head``: The head model or its file; None takes the file that ``headbench.json`` names, else the capture's
+    ``head_model.npz``. ``files``: Arguments masks, regions and eyelids of `load_head`, which finds them by itself beside a
+    FLAME pickle.
     """
     asset = read_head_model(folder, declaration, head, **files)
     check_version(folder, declaration, asset)
@@ -133,13 +128,9 @@ def read_tracking(
     noted. ``dynamic_offset`` is ignored, and noted if it is not zero. Coefficient vectors shorter than the head's
     bases are padded with zeros.
 
-    Parameters
-    ----------
-    teeth : TeethPolicy
-        "auto" appends teeth (see `with_teeth`) to every head without them, as GaussianAvatars does to
-        FLAME, so that all methods have the same; a head without lip rings stays without teeth, unless
-        it is FLAME's or the static offset has rows for them. "add" always appends them; "keep" does
-        not change the head.
+    ``teeth``: "auto" appends teeth (see `with_teeth`) to every head without them, as GaussianAvatars does to FLAME, so that
+    all methods have the same; a head without lip rings stays without teeth, unless it is FLAME's or the static offset has
+    rows for them. "add" always appends them; "keep" does not change the head.
     """
     reading = TrackingReading(head, subject, teeth)
     for timestep, path in sorted(files.items()):

@@ -22,7 +22,7 @@ from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import check_name, with_slashes
-from ..foreign import IMAGES, frame_route
+from ..open import IMAGES, frame_route
 from .layout import TRACKING_FOLDER
 
 INTRINSIC_KEYS = ("cx", "cy", "fl_x", "fl_y", "camera_angle_x")
@@ -156,12 +156,8 @@ UNDISTORT = (
 def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any]) -> FrameEntry:
     """Read and check one frame of the document at ``path``; see `read_transforms`.
 
-    Parameters
-    ----------
-    where : str
-        JSON path of the frame, for messages.
-    document : Mapping[str, Any]
-        The whole document, which may state intrinsics for all frames.
+    ``where``: JSON path of the frame, for messages. ``document``: The whole document, which may state intrinsics for all
+    frames.
     """
     if not isinstance(frame, dict):
         raise InputError(path, where, "an object", type(frame).__name__)
@@ -272,7 +268,7 @@ def _number(value: Any) -> float:
 
 
 def read_matrix(file: Path, key: str, value: Any, size: int) -> FloatArray:
-    """(size, size) matrix of a JSON. Raises `InputError` for anything but finite numbers of that shape."""
+    """(size, size) matrix of a JSON."""
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -283,7 +279,7 @@ def read_matrix(file: Path, key: str, value: Any, size: int) -> FloatArray:
 
 
 def read_rigid(file: Path, key: str, value: Any) -> FloatArray:
-    """(4, 4) rigid motion of a JSON. Raises `InputError` for another matrix."""
+    """(4, 4) rigid motion of a JSON."""
     matrix = read_matrix(file, key, value, 4)
     rotation = matrix[:3, :3]
     skew = np.abs(rotation @ rotation.T - _IDENTITY).max()

@@ -168,45 +168,30 @@ class SequencePlan:
 
 @dataclass(frozen=True, eq=False)
 class CapturePlan:
-    """Everything in a capture except its images.
-
-    Attributes
-    ----------
-    subject : str
-        Subject id, without underscores because folder names are parsed by them.
-    head : HeadArrays
-        Head model of all poses; V vertices, S identity coefficients.
-    shape : FloatArray
-        (S,) identity coefficients.
-    static_offset : FloatArray
-        (V, 3) metres.
-    cameras : Sequence[Camera]
-        In index order; the index is the position.
-    sequences : Sequence[SequencePlan]
-        In any order; the union numbers training sequences first.
-    test_sequences : Sequence[str]
-        Names of the sequences held out for self-reenactment.
-    novel_view_cameras : Sequence[str]
-        Ids of the cameras held out for novel views.
-    background : tuple[float, float, float]
-        (r, g, b) in [0, 1] that images are composited on.
-    cy : layout.CyConvention
-        Convention of the principal point in the JSONs; VHAP's is "bottom".
-    synthetic : Mapping[str, Any]
-        How the capture was synthesised (seed, noise, ...); empty for a recording.
-    """
+    """Everything in a capture except its images."""
 
     subject: str
+    """Subject id, without underscores because folder names are parsed by them."""
     head: HeadArrays
+    """Head model of all poses; V vertices, S identity coefficients."""
     shape: FloatArray
+    """(S,) identity coefficients."""
     static_offset: FloatArray
+    """(V, 3) metres."""
     cameras: Sequence[Camera]
+    """In index order; the index is the position."""
     sequences: Sequence[SequencePlan]
+    """In any order; the union numbers training sequences first."""
     test_sequences: Sequence[str]
+    """Names of the sequences held out for self-reenactment."""
     novel_view_cameras: Sequence[str]
+    """Ids of the cameras held out for novel views."""
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """(r, g, b) in [0, 1] that images are composited on."""
     cy: layout.CyConvention = "bottom"
+    """Convention of the principal point in the JSONs; VHAP's is "bottom"."""
     synthetic: Mapping[str, Any] = field(default_factory=dict)
+    """How the capture was synthesised (seed, noise, ...); empty for a recording."""
     cut: str = ""
 
     def __post_init__(self) -> None:
@@ -284,10 +269,7 @@ class CaptureWriter:
         write_image(self.image_path(sequence, timestep, camera), image)
 
     def write_metadata(self) -> Path:
-        """Write parameters, JSONs and the head model; return the union folder.
-
-        Raises `InputError` with the first image that is missing, damaged or of the wrong size.
-        """
+        """Write parameters, JSONs and the head model; return the union folder."""
         plan = self.plan
         for sequence in plan.sequences:
             for timestep in range(len(sequence.poses)):

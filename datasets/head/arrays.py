@@ -53,59 +53,41 @@ class HeadArrays:
     """A head model in FLAME's layout (a `HeadAsset`). Units: metres.
 
     V vertices, F triangles, S identity and E expression directions, J joints in the order of `JOINT_NAMES`.
-
-    Attributes
-    ----------
-    version : str
-        Name of the expression basis, equal to ``HeadPose.head_model`` of its poses.
-    template : FloatArray
-        (V, 3) mean head.
-    faces : IntArray
-        (F, 3) int64 triangles, counter-clockwise seen from outside.
-    shape_basis, expression_basis : FloatArray
-        (V, 3, S), (V, 3, E) metres per unit coefficient.
-    pose_basis : FloatArray
-        (V, 3, 9 (J-1)); column 9(j-1)+3r+c belongs to (R_j - I)[r, c].
-    joint_regressor : FloatArray
-        (J, V) dense; joints come from the shaped mesh.
-    skinning_weights : FloatArray
-        (V, J), rows sum to 1.
-    parents : IntArray
-        (J,), the root has -1 and every joint comes after its parent.
-    eyelid_basis : FloatArray | None
-        (V, 3, 2) left and right, added after skinning and rotated with root and neck; None if the model has none.
-    regions : Mapping[str, IntArray]
-        Vertex indices by name, unique; sorted except for `RING_REGIONS`.
-    landmarks : Mapping[str, int]
-        Vertex index by name; may be empty.
-    expression_names : tuple[str, ...]
-        Names of the expression directions, in order; () if they have none.
-    uv : FloatArray | None
-        (F, 3, 2) texture coordinates of the triangles' corners, in [0, 1] inside the chart; None if the model has no chart.
     """
 
     version: str
+    """Name of the expression basis, equal to ``HeadPose.head_model`` of its poses."""
     template: FloatArray
+    """(V, 3) mean head."""
     faces: IntArray
+    """(F, 3) int64 triangles, counter-clockwise seen from outside."""
     shape_basis: FloatArray
     expression_basis: FloatArray
+    """(V, 3, S), (V, 3, E) metres per unit coefficient."""
     pose_basis: FloatArray
+    """(V, 3, 9 (J-1)); column 9(j-1)+3r+c belongs to (R_j - I)[r, c]."""
     joint_regressor: FloatArray
+    """(J, V) dense; joints come from the shaped mesh."""
     skinning_weights: FloatArray
+    """(V, J), rows sum to 1."""
     parents: IntArray
+    """(J,), the root has -1 and every joint comes after its parent."""
     eyelid_basis: FloatArray | None = None
+    """(V, 3, 2) left and right, added after skinning and rotated with root and neck; None if the model has none."""
     regions: Mapping[str, IntArray] = field(default_factory=dict)
+    """Vertex indices by name, unique; sorted except for `RING_REGIONS`."""
     landmarks: Mapping[str, int] = field(default_factory=dict)
+    """Vertex index by name; may be empty."""
     expression_names: tuple[str, ...] = ()
+    """Names of the expression directions, in order; () if they have none."""
     uv: FloatArray | None = None
+    """(F, 3, 2) texture coordinates of the triangles' corners, in [0, 1] inside the chart; None if the model has no
+    chart."""
 
     def validate(self, file: str | PathLike[str]) -> HeadArrays:
         """Validate the model and return self.
 
-        Parameters
-        ----------
-        file : str | PathLike[str]
-            Source of the arrays, named in the error.
+        ``file``: Source of the arrays, named in the error.
         """
         arrays = {name: np.asarray(getattr(self, name)) for name in STORED} | self._optional()
         sizes = {"J": len(JOINT_NAMES), "9 (J - 1)": 9 * (len(JOINT_NAMES) - 1)}
@@ -134,14 +116,10 @@ class HeadArrays:
     ) -> FloatArray:
         """Vertices (V, 3) in a pose, metres, float64.
 
-        Parameters
-        ----------
-        shape : FloatArray | None
-            (S,) identity coefficients; None for the mean head.
-        static_offset : FloatArray | None
-            (V, 3) metres, added to the shaped template.
+        ``shape``: (S,) identity coefficients; None for the mean head. ``static_offset``: (V, 3) metres, added to the shaped
+        template.
         """
-        from .subject import PosedSubject  # with torch
+        from .model import PosedSubject  # with torch
 
         shape = np.zeros(self.shape_basis.shape[2]) if shape is None else shape
         offset = np.zeros(self.template.shape) if static_offset is None else static_offset
@@ -149,7 +127,7 @@ class HeadArrays:
 
     def named_expressions(self) -> list[Expression]:
         """Named expressions of the model; none for models like FLAME."""
-        from .names import named_expressions  # imported here because few callers need it
+        from .procedural.versions import named_expressions  # imported here because few callers need it
 
         return named_expressions(self.version, self.expression_names, self.expression_basis.shape[2])
 
@@ -283,7 +261,7 @@ def with_derived_regions(head: HeadArrays) -> HeadArrays:
 
 
 def region(head: HeadAsset, name: str) -> IntArray:
-    """Vertices of a region. Raises `InputError` if the region does not exist or is empty."""
+    """Vertices of a region."""
     if not len(head.regions.get(name, ())):
         known = ", ".join(sorted(head.regions)) or "none"
         remedy = "For a FLAME pickle, give FLAME_masks.pkl as masks=."

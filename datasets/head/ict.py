@@ -33,9 +33,18 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, Member, check_arrays, read_npz
 from ...bench.io.documents import read_json, read_text
 from ...bench.io.files import read_bytes, reading
-from ..rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .arrays import HeadArrays
-from .geometry import border_edges, even_weights, fit_sphere, mesh_edges, smoothstep
+from .geometry import (
+    LENGTH_BITS,
+    REGRESSOR_BITS,
+    SHARE_BITS,
+    border_edges,
+    even_weights,
+    fit_sphere,
+    mesh_edges,
+    on_grid,
+    smoothstep,
+)
 
 VERSION = "ict-facekit"
 LANDMARKS = tuple(f"ibug_{index:02d}" for index in range(68))
@@ -137,13 +146,8 @@ def expression_names(content: Mapping[str, np.ndarray]) -> tuple[str, ...]:
 def ict_head(file: str | PathLike[str], content: Mapping[str, np.ndarray]) -> HeadArrays:
     """Rig the kit: metres, +y up, +z front, origin amid the head.
 
-    Parameters
-    ----------
-    file : str | PathLike[str]
-        Named in errors.
-    content : Mapping[str, np.ndarray]
-        Members of the npz: ``v_neutral`` and deltas in centimetres, triangles with materials, names,
-        landmark vertices.
+    ``file``: Named in errors. ``content``: Members of the npz: ``v_neutral`` and deltas in centimetres, triangles with
+    materials, names, landmark vertices.
 
     Returns
     -------
@@ -276,19 +280,13 @@ Parts = Mapping[str, IntArray]
 
 @dataclass(frozen=True)
 class Profile:
-    """The head from the side: proportions that place the neck. Metres.
-
-    Attributes
-    ----------
-    length : float
-        Distance from nasion to chin.
-    neck_top, neck_base : float
-        Heights along the neck at which the head and the shoulders begin.
-    """
+    """The head from the side: proportions that place the neck. Metres."""
 
     length: float
+    """Distance from nasion to chin."""
     neck_top: float
     neck_base: float
+    """Heights along the neck at which the head and the shoulders begin."""
 
     # The neck leans forward by about 25 degrees: the throat begins lower than the nape.
     _UP = np.array([0.0, np.cos(0.43), np.sin(0.43)])
@@ -314,12 +312,8 @@ def mesh_parts(
 ) -> Parts:
     """Split the mesh: sorted vertex indices by part.
 
-    Parameters
-    ----------
-    materials : Mapping[str, IntArray]
-        Vertices of each material's triangles.
-    jaw_open : FloatArray
-        (V, 3) displacement of ``jawOpen``, which separates lower teeth from upper teeth.
+    ``materials``: Vertices of each material's triangles. ``jaw_open``: (V, 3) displacement of ``jawOpen``, which separates
+    lower teeth from upper teeth.
     """
     for name in _MATERIALS:
         if name not in materials or not len(materials[name]):

@@ -43,16 +43,7 @@ def read_chart(path: Path, faces: IntArray) -> FloatArray:
 
     The OBJ file may order the triangles differently, begin each at another corner, and contain additional ones.
 
-    Parameters
-    ----------
-    faces : IntArray
-        (F, 3) triangles of the head model.
-
-    Raises
-    ------
-    InputError
-        The file is missing or damaged, lacks texture coordinates or a triangle of the head model, or has non-finite
-        coordinates or faces other than triangles.
+    ``faces``: (F, 3) triangles of the head model.
     """
     text = read_text(path, "mesh")
     with reading(path, "an OBJ mesh of triangles with texture coordinates"):
@@ -124,11 +115,6 @@ def load_head(
         Name of the expression basis. Required if the file name of a FLAME pickle does not contain it
         ("flame2020", "flame2023"); must agree with the version in an npz of this package, and with the content of
         FLAME 2023 Open ("flame2023_open").
-
-    Raises
-    ------
-    InputError
-        A file is missing, damaged or of an unknown kind, or its arrays do not form a head.
     """
     path = Path(path)
     start = _ZIP  # also of the folder of ICT-FaceKit
@@ -200,13 +186,7 @@ SUPR's, differ from those of FLAME 2023, although its archive calls the file ``f
 
 
 def flame_version(path: Path) -> str:
-    """Version of a FLAME pickle by its usual file or folder name, such as ``FLAME2020/male_model.pkl``.
-
-    Raises
-    ------
-    InputError
-        The name is ambiguous. The files have the same layout, so confusing them would go unnoticed.
-    """
+    """Version of a FLAME pickle by its usual file or folder name, such as ``FLAME2020/male_model.pkl``."""
     stem = path.stem.lower().replace("-", "_")
     folder = re.fullmatch("flame[-_ ]?(2020|2023)", path.parent.name.lower())
     years = set(re.findall(r"(?<!\d)(2020|2023)(?!\d)", stem))

@@ -6,14 +6,16 @@ the formulation of the skinning is that of SMPL (Loper et al., SIGGRAPH Asia 201
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import FloatArray, HeadAsset, HeadPose
+from ...bench.contracts import Camera, Clip, FloatArray, HeadAsset, HeadPose
 from ...bench.errors import InputError
 from ...bench.native.dispatch import to_device
 from .rotations import axis_angle_to_matrix
@@ -25,12 +27,8 @@ class HeadModel(torch.nn.Module):
     Every argument is ``(B, n)`` or ``(n,)``, and arguments of batch size 1 are broadcast. Lengths are metres,
     rotations axis-angle in radians.
 
-    Parameters
-    ----------
-    asset : HeadAsset
-        Head in FLAME's layout, e.g. `HeadArrays`.
-    dtype, device : torch.dtype, torch.device | str
-        Type and device of the buffers; inputs must match.
+    ``asset``: Head in FLAME's layout, e.g. `HeadArrays`. ``dtype``, ``device``: Type and device of the buffers; inputs must
+    match.
     """
 
     template: Tensor
@@ -189,8 +187,7 @@ class HeadModel(torch.nn.Module):
     def pose_arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
         """Poses as arguments of `forward`, with this model's dtype and device.
 
-        ``eyelids`` is included only if the model has eyelid bases (zeros for poses without them). Raises as
-        `pose_columns`.
+        ``eyelids`` is included only if the model has eyelid bases (zeros for poses without them).
         """
         columns = self.pose_columns(poses)
         # One array, so that one copy takes it to a device.
@@ -259,14 +256,8 @@ def joint_motions(rotations: Tensor, joints: Tensor, parents: Sequence[int]) -> 
     With local rotation Q_j and parent p: R_j = R_p Q_j and o_j = o_p + (R_p - R_j) c_j for a joint with rest position
     c_j.
 
-    Parameters
-    ----------
-    rotations : Tensor
-        (B, J, 3, 3) local rotation of each joint relative to its parent.
-    joints : Tensor
-        (B, J, 3) rest positions; the root does not move.
-    parents : Sequence[int]
-        Parent of each joint, -1 for the root; parents come first.
+    ``rotations``: (B, J, 3, 3) local rotation of each joint relative to its parent. ``joints``: (B, J, 3) rest positions;
+    the root does not move. ``parents``: Parent of each joint, -1 for the root; parents come first.
 
     Returns
     -------
@@ -293,3 +284,92 @@ def _rows(values: Tensor, size: int, name: str) -> Tensor:
     if rows.ndim != 2 or rows.shape[1] != size:
         raise ValueError(f"{name}: expected (B, {size}) or ({size},), found {tuple(values.shape)}")
     return rows
+
+
+BATCH = 64
+"""Number of poses evaluated at once, to limit memory for long sequences."""
+
+
+class PosedSubject:
+    """One identity of a head model.
+
+    ``shape``: (S,) identity coefficients. ``static_offset``: (V, 3) metres.
+    """
+
+    def __init__(
+        self,
+        head: HeadAsset,
+        shape: FloatArray,
+        static_offset: FloatArray,
+        dtype: torch.dtype = torch.float64,
+    ):
+        self._model = HeadModel(head, dtype=dtype)
+        identity = {"shape": shape, "static_offset": static_offset}
+        self._identity = {
+            name: torch.tensor(np.asarray(values), dtype=dtype) for name, values in identity.items()
+        }
+        self._canonical = self._model.canonical(**self._identity)
+        self.version = head.version
+        self.neutral: FloatArray = self._canonical[0].numpy()
+        """(V, 3) unposed head, metres."""
+
+    @classmethod
+    def of(cls, clip: Clip, dtype: torch.dtype = torch.float64) -> PosedSubject:
+        """The subject of a clip."""
+        return cls(clip.head, clip.shape, clip.static_offset, dtype)
+
+    def meshes(self, poses: Sequence[HeadPose]) -> FloatArray:
+        """(T, V, 3) vertices in the world, metres."""
+        return np.concatenate([*self.batches(poses)])
+
+    def batches(self, poses: Sequence[HeadPose], size: int = BATCH) -> Iterator[FloatArray]:
+        """`meshes` of up to ``size`` poses at a time."""
+        for arguments in self._arguments(poses, size):
+            with torch.no_grad():
+                yield self._model(canonical=self._canonical, **arguments).numpy()
+
+    def each(
+        self, clip: Clip, timesteps: Sequence[int], size: int = BATCH
+    ) -> Iterator[tuple[int, FloatArray]]:
+        """Yield (timestep, (V, 3) mesh) for a clip's poses, computed in batches of ``size``."""
+        poses = [clip.poses[timestep] for timestep in timesteps]
+        return zip(timesteps, chain.from_iterable(self.batches(poses, size)))
+
+    def motions(self, poses: Sequence[HeadPose]) -> FloatArray:
+        """(T, 4, 4) rigid motion of the head, from the frame with the neck joint at rest to the world, metres."""
+
+        moving = ("expression", "rotation", "neck", "translation")
+        return np.concatenate(
+            [
+                self._model.head_transform(
+                    **self._identity, **{name: arguments[name] for name in moving}
+                ).numpy()
+                for arguments in self._arguments(poses, BATCH)
+            ]
+        )
+
+    def translations(self, poses: Sequence[HeadPose], motions: FloatArray) -> FloatArray:
+        """(T, 3) translations, metres, with which poses without translation reproduce (T, 4, 4) ``motions``."""
+        return np.asarray(motions[:, :3, 3] - self.motions(poses)[:, :3, 3])
+
+    def _arguments(self, poses: Sequence[HeadPose], size: int) -> Iterator[dict[str, torch.Tensor]]:
+        for start in range(0, max(len(poses), 1), size):  # without poses the model raises an error
+            yield self._model.pose_arguments(poses[start : start + size])
+
+
+def camera_in_head_frame(camera: Camera, motion: FloatArray) -> Camera:
+    """The camera relative to a head that does not move; ``motion`` is the (4, 4) rigid motion of the pose."""
+    return replace(camera, world_to_camera=np.asarray(camera.world_to_camera, np.float64) @ motion)
+
+
+def pose_in_head_frame(pose: HeadPose) -> HeadPose:
+    """The pose without rigid motion."""
+    rest = np.zeros(3)
+    return replace(pose, rotation=rest, neck=rest, translation=rest)
+
+
+def resting(head: HeadAsset, subject: str = "") -> HeadPose:
+    """The neutral pose of a head model, at the origin."""
+    expression, none = np.zeros(head.expression_basis.shape[2]), np.zeros(3)
+    lids = None if head.eyelid_basis is None else np.zeros(head.eyelid_basis.shape[2])
+    return HeadPose(head.version, expression, none, none, none, np.zeros(6), none, lids, subject)

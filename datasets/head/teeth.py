@@ -161,11 +161,8 @@ def lip_rings(asset: HeadAsset) -> tuple[IntArray, IntArray]:
     lower one D // 3 edges inside the border, without the corners of the mouth. In FLAME, D is 7, and these rings are the
     two lists of GaussianAvatars' code.
 
-    Parameters
-    ----------
-    asset : HeadAsset
-        Head whose ring regions are returned unchanged if it has both; otherwise the rings are found
-        from ``lips``, with `RING_LENGTH` vertices, fewer if the lips have fewer.
+    ``asset``: Head whose ring regions are returned unchanged if it has both; otherwise the rings are found from ``lips``,
+    with `RING_LENGTH` vertices, fewer if the lips have fewer.
     """
     where = f"head model {asset.version!r}"
     if all(name in asset.regions for name in RING_REGIONS):

@@ -18,9 +18,29 @@ from ...bench.protocol import evenly_with_ends
 from ..clip import CaptureClip
 from ..figures import HELD_OUT, MUTED, TRAIN, bands, hexadecimal, new_figure, shortened, show
 from ..head.geometry import rigid_alignment
-from ..head.subject import PosedSubject
+from ..head.model import PosedSubject
 from ..mesh_pictures import draw_mesh, rasterize_mesh
 from .statistics import KEPT_VARIANCE, ExpressionSpace, SequenceRow, SplitRow
+
+
+def draw_overlay(clip: CaptureClip, timesteps: Sequence[int], cameras: Sequence[str]) -> ByteArray:
+    """Images of some timesteps (rows) and cameras, and beside each one the mesh over it.
+
+    Returns (H, W, 3) 8-bit sRGB. Images of another size than the first are left out.
+    """
+    subject, rows = PosedSubject.of(clip), []
+    height, width = clip.image(clip.frame_at[timesteps[0], cameras[0]]).shape[:2]
+    for timestep, mesh in subject.each(clip, timesteps):
+        row = []
+        for name in cameras:
+            camera = clip.cameras[name].resized(width, height)
+            image = clip.image(clip.frame_at[timestep, name])
+            if image.shape[:2] != (height, width):
+                continue
+            row += [image, draw_mesh(mesh, clip.head.faces, camera, background=image, opacity=0.6)]
+        rows.append(np.concatenate(row, axis=1))
+    return np.concatenate(rows)
+
 
 WIDTH = 16.0
 """Width of the figure, inches."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +13,54 @@ import torch
 from ...bench.contracts import FloatArray, FrameKey, HeadPose
 from ..clip import CaptureClip
 from ..head.rotations import axis_angle_to_matrix
-from ..novelty import Novelty, displacement_metric, novelty
+
+SPAN_VARIANCE = 0.99
+"""Fraction of the training variance in the span of training; the rest is regarded as tracking noise."""
+
+
+class Novelty(NamedTuple):
+    """Novelty of some expressions relative to those of training."""
+
+    outside: float
+    """Fraction in [0, 1] of the root mean square displacement that lies outside the span of training."""
+    beyond: float
+    """Fraction in [0, 1] of the expressions that leave the range of training along some direction of its span by more
+    than a tenth of that range."""
+
+
+def displacement_metric(basis: FloatArray) -> FloatArray:
+    """(E, E) matrix from coefficients to faces whose distances are root mean squares over the vertices.
+
+    This is exact without V x T values in memory: distances between faces are distances between coefficients in the
+    metric of the basis, (V, 3, E), which is its Gram matrix divided by the number of vertices.
+    """
+    basis = np.asarray(basis, np.float64)
+    values, vectors = np.linalg.eigh(np.einsum("vie,vif->ef", basis, basis) / len(basis))
+    metric: FloatArray = vectors * np.sqrt(np.maximum(values, 0))
+    return metric
+
+
+def novelty(train: FloatArray, test: FloatArray, span: float = SPAN_VARIANCE) -> Novelty:
+    """Compare faces, (T, E) and (N, E) as `displacement_metric` gives them; at least one of each.
+
+    ``span`` is the fraction of the training variance in the span of training.
+    """
+    mean = train.mean(axis=0)
+    _, singular, axes = np.linalg.svd(train - mean, full_matrices=False)
+    variance = singular**2
+    if not variance.sum() > 0:
+        moved = float(np.any(np.abs(test - mean) > 0))
+        return Novelty(moved, moved)
+    kept = int(np.searchsorted(np.cumsum(variance) / variance.sum(), span) + 1)
+    axes = axes[:kept]
+    found, known = (test - mean) @ axes.T, (train - mean) @ axes.T
+    total = ((test - mean) ** 2).sum()
+    rest = ((test - mean - found @ axes) ** 2).sum()
+    low, high = known.min(axis=0), known.max(axis=0)
+    margin = 0.1 * (high - low)
+    beyond = ((found < low - margin) | (found > high + margin)).any(axis=1)
+    return Novelty(float(np.sqrt(rest / total)) if total > 0 else 0.0, float(beyond.mean()))
+
 
 KEPT_VARIANCE = 0.95
 
@@ -30,64 +78,43 @@ class SplitRow:
 
 @dataclass(frozen=True)
 class SequenceRow:
-    """Motion of one sequence. Excluded timesteps are only counted.
-
-    Attributes
-    ----------
-    held_out : bool
-        Whether its timesteps test self-reenactment.
-    jaw_deg : tuple[float, float, float]
-        Minimum, median and maximum opening of the jaw, degrees.
-    head_deg : float
-        Largest rotation of the head from its mean direction, degrees.
-    head_mm : float
-        Largest distance of the head from its mean position, millimetres.
-    expression_sigma : float
-        Root mean square over timesteps of the coefficients' length over sqrt(E): 1 if every
-        coefficient has a standard deviation of 1.
-    reach_mm : tuple[float, float]
-        Median and maximum displacement of the farthest-moving vertex by expression alone,
-        millimetres.
-    """
+    """Motion of one sequence. Excluded timesteps are only counted."""
 
     sequence: str
     held_out: bool
+    """Whether its timesteps test self-reenactment."""
     timesteps: int
     excluded: int
     jaw_deg: tuple[float, float, float]
+    """Minimum, median and maximum opening of the jaw, degrees."""
     head_deg: float
+    """Largest rotation of the head from its mean direction, degrees."""
     head_mm: float
+    """Largest distance of the head from its mean position, millimetres."""
     expression_sigma: float
+    """Root mean square over timesteps of the coefficients' length over sqrt(E): 1 if every coefficient has a standard
+    deviation of 1."""
     largest_coefficient: float
     reach_mm: tuple[float, float]
+    """Median and maximum displacement of the farthest-moving vertex by expression alone, millimetres."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExpressionSpace:
-    """Principal components of the face's displacement by expression, over the training timesteps.
-
-    Attributes
-    ----------
-    timesteps : Sequence[int]
-        Timesteps of the capture without excluded ones.
-    held_out : np.ndarray
-        (T,) whether a timestep is held out.
-    scores_mm : FloatArray
-        (T, K) root-mean-square displacement of the face's vertices along each component.
-    explained : FloatArray
-        (K,) fraction of the training variance.
-    novelty_mm : Mapping[int, float]
-        RMS distance of the face to the nearest training face, by held-out timestep.
-    novelty : Mapping[str, Novelty]
-        Novelty of each held-out sequence against training.
-    """
+    """Principal components of the face's displacement by expression, over the training timesteps."""
 
     timesteps: Sequence[int]
+    """Timesteps of the capture without excluded ones."""
     held_out: np.ndarray
+    """(T,) whether a timestep is held out."""
     scores_mm: FloatArray
+    """(T, K) root-mean-square displacement of the face's vertices along each component."""
     explained: FloatArray
+    """(K,) fraction of the training variance."""
     novelty_mm: Mapping[int, float]
+    """RMS distance of the face to the nearest training face, by held-out timestep."""
     novelty: Mapping[str, Novelty]
+    """Novelty of each held-out sequence against training."""
 
     @cached_property
     def kept(self) -> int:

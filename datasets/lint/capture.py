@@ -22,13 +22,12 @@ from ...bench.io.files import digest
 from ...bench.io.images import ImageInfo, probe_image
 from ..clip import CaptureClip, FrameFiles
 from ..ga import layout
-from ..ga.content_digests import content_digests, digests_of_same_size
 from ..ga.reader import build_clip, read_content
 from ..ga.tracking import Tracking, TrackingReading, check_neutral, pose_to_parameters
 from ..ga.transforms import Fault, Faults, FrameEntry
-from ..ga.validate import sequence_names
+from ..ga.validate import content_digests, digests_of_same_size, sequence_names
 from ..head.arrays import HeadArrays
-from ..head.subject import PosedSubject
+from ..head.model import PosedSubject
 from ..images import read_image, read_mask
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ import numpy as np
 from ...bench.contracts import ByteArray, FloatArray
 from ...bench.progress import counted
 from ..ga import layout
-from ..ga.cameras import ROTATION_TOLERANCE, contradicted_focal, same_intrinsics
-from ..ga.principal_point import OutlineView, weigh_cy
+from ..ga.cameras import ROTATION_TOLERANCE, OutlineView, contradicted_focal, same_intrinsics, weigh_cy
 from ..ga.transforms import FrameEntry
 from .camera_table import FEWEST_CAMERAS, STILL_SHARE, CameraFacts, frozen
 from .evidence import Evidence, first_entries

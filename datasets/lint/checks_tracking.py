@@ -13,7 +13,7 @@ from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.progress import counted
 from ..ga import layout
-from ..novelty import displacement_metric, novelty
+from ..inspect.statistics import displacement_metric, novelty
 from .checks_cameras import faulty_cameras, misplaced
 from .evidence import Evidence
 from .rules import Hit, rule, some, spans

@@ -25,8 +25,6 @@ def lint(settings: LintSettings, progress: Progress = no_progress) -> CommandRes
     """Check a capture for faults that make a comparison unfair or wrong.
 
     Passes if there are no errors; with ``strict``, also no warnings.
-
-    Raises `InputError` if there is no capture, or a code to ignore does not exist.
     """
     from .catalogue import RULES
 

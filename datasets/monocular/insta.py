@@ -41,7 +41,7 @@ from ..ga.transforms import check_lenses, read_rigid
 from ..head.arrays import JOINT_NAMES, HeadArrays
 from ..head.loaders import EYELIDS_REMEDY
 from ..head.model import HeadModel
-from .track import VIDEO, Track, VideoFrame, coefficients, frame_number, ordered, rotations_of_6d
+from .clip import VIDEO, Track, VideoFrame, coefficients, frame_number, ordered, rotations_of_6d
 
 WORST_DISTANCE = 1e-4
 """Maximum median distance of vertices from the mesh, metres: rounding gives 1e-8, another head model of the same
@@ -57,10 +57,7 @@ _ROWS = 200
 
 def read_vertices(path: Path, count: int) -> FloatArray:
     """(V, 3) vertices of a Wavefront OBJ; faces are not read, since programs simplify them without changing the
-    vertices.
-
-    Raises `InputError` for a file that is missing, or has another number of vertices than ``count``.
-    """
+    vertices."""
     content = read_bytes(path, "a Wavefront OBJ")
     found = _VERTEX.findall(content)
     if len(found) != count:
@@ -135,14 +132,8 @@ class MeshFit:
     def fit_pose(self, mesh: FloatArray, shaped: FloatArray, known: FloatArray | None) -> Pose:
         """Jaw, eyes and eyelids of one mesh.
 
-        Parameters
-        ----------
-        mesh : FloatArray
-            (V, 3).
-        shaped : FloatArray
-            (V, 3) head with identity and expression, unposed.
-        known : FloatArray | None
-            (9,) jaw and eyes if they are known; only the eyelids are fitted then.
+        ``mesh``: (V, 3). ``shaped``: (V, 3) head with identity and expression, unposed. ``known``: (9,) jaw and eyes if they
+        are known; only the eyelids are fitted then.
         """
         turns, lids = np.zeros(9) if known is None else known, np.zeros(self._lids.shape[2])
         rows = self._rows
@@ -254,7 +245,7 @@ def is_insta(root: Path) -> bool:
 
 
 def read_insta(root: Path, head: HeadArrays, progress: Progress) -> Track:
-    """Read a folder. Raises `InputError` for missing data and data that do not fit the head model."""
+    """Read a folder."""
     held_out: frozenset[tuple[str, int]] | None = None
     documents = [root / file for file in (SPLIT_FILES["train"], SPLIT_FILES["self_reenactment"])]
     if not all(document.is_file() for document in documents):

@@ -30,9 +30,8 @@ from ..ga.tracking import TeethPolicy, find_head
 from ..ga.transforms import read_rigid
 from ..head.arrays import HeadArrays
 from ..steps.exclude import exclude_given, exclude_timesteps
-from .clip import WHITE, clip_of_track
+from .clip import WHITE, Track, VideoFrame, clip_of_track, coefficients, frame_number, ordered
 from .insta import is_insta, read_insta
-from .track import Track, VideoFrame, coefficients, frame_number, ordered
 
 PARAMETERS = "flame_params.json"
 SCALE = 4.0
@@ -76,7 +75,7 @@ def _lists_frames(path: Path) -> bool:
 
 
 def read_imavatar(root: Path, head: HeadArrays, progress: Progress) -> Track:
-    """Read all videos of a subject. Raises `InputError` for missing data and data that do not fit the head model."""
+    """Read all videos of a subject."""
     folders = videos(root)
     frames: list[VideoFrame] = []
     shape: FloatArray | None = None

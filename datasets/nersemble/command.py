@@ -9,8 +9,7 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind
 from ...bench.specs import CommandResult, command
-from .names import SUBJECT_NAMES, chosen_subjects
-from .settings import PrepareSettings
+from .names import SUBJECT_NAMES, PrepareSettings, chosen_subjects
 
 if TYPE_CHECKING:
     from .plan import PreparationPlan
@@ -25,7 +24,7 @@ def prepare_nersemble(settings: PrepareSettings, progress: Progress = no_progres
     """
     from .plan import plan_subject
     from .prepare import prepare
-    from .unions import check_unions
+    from .tracking import check_unions
 
     subjects = chosen_subjects(settings.subjects)
     if bool(settings.root) == bool(settings.union_root):

@@ -26,7 +26,7 @@ from ...bench.contracts import ByteArray, FloatArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import check_numbers, read_npy
 from ...bench.io.images import read_bgr
-from ..srgb import srgb_to_linear
+from ..images import srgb_to_linear
 
 Correction = Callable[[ByteArray], ByteArray]
 """From (H, W, 3) 8-bit RGB to the same."""
@@ -146,7 +146,7 @@ def _to_bytes(levels: NDArray[Any]) -> ByteArray:
 
 
 def affine_correction(path: Path) -> AffineCorrection:
-    """Read version 1, ``SER.npy``. Raises `InputError` for a file that holds no such matrix."""
+    """Read version 1, ``SER.npy``."""
     matrix = read_npy(path)
     if matrix.dtype.kind not in "fiu" or matrix.shape not in ((3, 4), (4, 4)):
         found = f"{matrix.dtype} {matrix.shape}"
@@ -182,16 +182,9 @@ def prepare_pixels(
     set, it is I - (1 - a) B, within [0, a], which removes the background from soft edges. Without it, it is a I, as in
     VHAP, and edges keep a fraction a (1 - a) of the background. Colours are corrected at the small size, as VHAP does.
 
-    Parameters
-    ----------
-    bgr : ByteArray
-        (H, W, 3) in OpenCV's channel order.
-    mask : ByteArray | None
-        (H, W) foreground coverage; with None the image keeps its background.
-    size : tuple[int, int]
-        (width, height) of the result, at most the frame's.
-    still : ByteArray | None
-        (H, W, 3) image of the empty set from the same camera, in OpenCV's channel order.
+    ``bgr``: (H, W, 3) in OpenCV's channel order. ``mask``: (H, W) foreground coverage; with None the image keeps its
+    background. ``size``: (width, height) of the result, at most the frame's. ``still``: (H, W, 3) image of the empty set
+    from the same camera, in OpenCV's channel order.
 
     Returns
     -------
@@ -220,10 +213,7 @@ def _foreground_share(bgr: ByteArray, mask: ByteArray, still: ByteArray | None) 
 
 
 def read_still(path: Path, size: tuple[int, int]) -> ByteArray:
-    """Still of the empty set as OpenCV decodes it, resized to the frames' (width, height).
-
-    Raises `InputError` if it does not decode.
-    """
+    """Still of the empty set as OpenCV decodes it, resized to the frames' (width, height)."""
     still = read_bgr(path)
     return cv2.resize(still, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 

@@ -21,12 +21,12 @@ from .names import (
     TEST_SEQUENCE,
     TONGUE_SEQUENCES,
     UNION10_SEQUENCES,
+    PrepareSettings,
     union10_held_out,
 )
 from .pixels import Correction
 from .recording import Participant, participant, read_calibration
 from .sequence import RecordedSequence, read_sequence
-from .settings import PrepareSettings
 from .tracking import TrackedSequence, find_tracked, read_tracked
 
 CY: layout.CyConvention = "bottom"
@@ -41,25 +41,17 @@ _FLAME_VERSIONS = ("flame2020", _USUAL_HEAD, "flame2023_no_jaw", OPEN)
 
 @dataclass(frozen=True, eq=False)
 class SequenceJob:
-    """One sequence to prepare.
-
-    Attributes
-    ----------
-    cameras : Sequence[Camera]
-        Cameras of the prepared images in index order, in the aligned world.
-    corrections : Mapping[str, Correction]
-        Colour correction by serial; empty for none.
-    stills : Mapping[str, Path]
-        Images of the empty set by serial, used to remove its light from soft edges; empty to skip this.
-    tracked : TrackedSequence | None
-        Parameters, or None if there are none yet.
-    """
+    """One sequence to prepare."""
 
     recorded: RecordedSequence
     cameras: Sequence[Camera]
+    """Cameras of the prepared images in index order, in the aligned world."""
     corrections: Mapping[str, Correction]
+    """Colour correction by serial; empty for none."""
     stills: Mapping[str, Path]
+    """Images of the empty set by serial, used to remove its light from soft edges; empty to skip this."""
     tracked: TrackedSequence | None
+    """Parameters, or None if there are none yet."""
     folder: Path
 
     @property
@@ -117,7 +109,7 @@ class PreparationPlan:
 
 
 def plan_subject(settings: PrepareSettings, subject: str) -> PreparationPlan:
-    """Read everything about one subject except its pixels. Raises `InputError` for the first fault."""
+    """Read everything about one subject except its pixels."""
     one = participant(Path(settings.root), subject)
     out = Path(os.path.abspath(settings.out))
     calibration = read_calibration(one.calibration_file)

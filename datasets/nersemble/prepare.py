@@ -50,10 +50,7 @@ class RawFrame(NamedTuple):
 
 
 def read_frames(view: RecordedView, numbers: Sequence[int]) -> Iterator[RawFrame]:
-    """Decode the frames with these ascending numbers, one at a time.
-
-    Raises `InputError` if a frame does not decode, or a video ends before the number of frames in its index.
-    """
+    """Decode the frames with these ascending numbers, one at a time."""
     if view.video is None:
         for number in numbers:
             mask = read_mask(view.masks[number], view.size) if view.masks else None
@@ -211,33 +208,24 @@ class SequenceState:
 
 @dataclass(frozen=True)
 class SubjectResult:
-    """Result for a subject.
-
-    Attributes
-    ----------
-    written, kept : int
-        Number of images.
-    frames : dict[str, int]
-        Frames per split of the union; empty where there is none.
-    union : Path | None
-        The folder to give to a reader, or None.
-    missing : tuple[str, ...]
-        Reasons why the capture is not complete, one sentence each.
-    """
+    """Result for a subject."""
 
     subject: str
     written: int
     kept: int
+    """Number of images."""
     frames: dict[str, int]
+    """Frames per split of the union; empty where there is none."""
     union: Path | None
+    """The folder to give to a reader, or None."""
     missing: tuple[str, ...]
+    """Reasons why the capture is not complete, one sentence each."""
 
 
 def prepare(
     plans: Sequence[PreparationPlan], *, workers: int = 0, progress: Progress = no_progress
 ) -> list[SubjectResult]:
-    """Prepare subjects. Raises `InputError` before the first image if a folder has other content, and during the run
-    for truncated videos and a full disk; another call then continues."""
+    """Prepare subjects."""
     with ExitStack() as stack:
         for plan in plans:  # one by one: other subjects of the same folder may be prepared elsewhere
             stack.enter_context(locked(plan.union, beside=True))
@@ -275,7 +263,7 @@ def _prepare(plans: Sequence[PreparationPlan], workers: int, progress: Progress)
 
 
 def _checked_state(job: SequenceJob) -> SequenceState:
-    """The record of a job's folder. Raises `InputError` if its images were made from other inputs."""
+    """The record of a job's folder."""
     path = job.folder / RECORD_FILE
     if not path.exists():
         if (job.folder / "images").is_dir() and any((job.folder / "images").iterdir()):

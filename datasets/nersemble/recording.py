@@ -48,32 +48,23 @@ _AVAILABLE = ("x", "m")
 
 @dataclass(frozen=True, eq=False)
 class Participant:
-    """One participant's folder in a recording.
-
-    Attributes
-    ----------
-    subject : str
-        Three-digit id.
-    calibration_file : Path
-        ``camera_params.json``.
-    sequences : Mapping[str, Path]
-        Folder by full sequence name, without ``BACKGROUND``.
-    backgrounds : Mapping[str, Path]
-        Still of the empty set by serial.
-    listed : tuple[str, ...]
-        Sequences that the release's metadata lists; empty without metadata.
-    """
+    """One participant's folder in a recording."""
 
     subject: str
+    """Three-digit id."""
     calibration_file: Path
+    """``camera_params.json``."""
     sequences: Mapping[str, Path]
+    """Folder by full sequence name, without ``BACKGROUND``."""
     backgrounds: Mapping[str, Path] = field(default_factory=dict)
+    """Still of the empty set by serial."""
     listed: tuple[str, ...] = ()
+    """Sequences that the release's metadata lists; empty without metadata."""
     colour_file: Path | None = None
     colour_folder: Path | None = None
 
     def match(self, wanted: str) -> str:
-        """Full name of a sequence given by name or unique prefix. Raises `InputError` where none is there."""
+        """Full name of a sequence given by name or unique prefix."""
         try:
             return match_sequence(self.calibration_file, wanted, self.sequences)
         except InputError as error:
@@ -84,10 +75,7 @@ class Participant:
             raise InputError(error.file, error.key, error.expected, error.found, remedy) from None
 
     def corrections(self, sequence: str, serials: Iterable[str]) -> dict[str, Correction]:
-        """Colour correction by serial; empty if the recording has no colour calibration.
-
-        Raises `InputError` if there is one, but not for all of ``serials``.
-        """
+        """Colour correction by serial; empty if the recording has no colour calibration."""
         if self.colour_file is not None:
             entries = read_json(self.colour_file)
             return {s: polynomial_correction(self.colour_file, s, entries.get(s)) for s in serials}
@@ -102,7 +90,7 @@ class Participant:
 
 
 def participants(root: Path) -> dict[str, Participant]:
-    """Participants under ``root`` by id. Raises `InputError` if there are none."""
+    """Participants under ``root`` by id."""
     if not root.is_dir():
         raise InputError(root, "", "a folder with recordings", "a file" if root.exists() else "nothing")
     listed = _listed_sequences(root)
@@ -118,7 +106,7 @@ def participants(root: Path) -> dict[str, Participant]:
 
 
 def participant(root: Path, subject: str) -> Participant:
-    """One participant, with calibration. Raises `InputError` if the recording lacks either."""
+    """One participant, with calibration."""
     known = participants(root)
     if subject not in known:
         raise InputError(root, "subject", f"one out of {', '.join(known)}", subject)
@@ -178,24 +166,16 @@ def _listed_sequences(root: Path) -> dict[str, tuple[str, ...]]:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Cameras by serial, in the file's order, which is the order of camera indices.
-
-    Attributes
-    ----------
-    file : Path
-        Source of the values, for error messages.
-    world_to_camera : Mapping[str, FloatArray]
-        (4, 4) by serial.
-    intrinsics : Mapping[str, FloatArray]
-        (3, 3) by serial, pixels of an image of ``size``.
-    size : tuple[int, int] | None
-        (width, height) that the intrinsics refer to; None if they refer to the images as they are.
-    """
+    """Cameras by serial, in the file's order, which is the order of camera indices."""
 
     file: Path
+    """Source of the values, for error messages."""
     world_to_camera: Mapping[str, FloatArray]
+    """(4, 4) by serial."""
     intrinsics: Mapping[str, FloatArray]
+    """(3, 3) by serial, pixels of an image of ``size``."""
     size: tuple[int, int] | None
+    """(width, height) that the intrinsics refer to; None if they refer to the images as they are."""
 
     @property
     def serials(self) -> list[str]:
@@ -205,8 +185,7 @@ class Calibration:
     def camera(self, serial: str, size: tuple[int, int], output: tuple[int, int]) -> Camera:
         """Camera for images of ``output`` size made of images of ``size``, both (width, height).
 
-        Pixels scale with the edges of the image: no half-pixel term. Raises `InputError` where the images
-        have another shape than the calibration refers to.
+        Pixels scale with the edges of the image: no half-pixel term.
         """
         width, height = self.size or size
         if abs(size[0] * height - size[1] * width) > max(width, height):
@@ -248,7 +227,7 @@ def _gram_schmidt(matrix: FloatArray) -> FloatArray | None:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read and check ``camera_params.json``. Raises `InputError` for the first fault."""
+    """Read and check ``camera_params.json``."""
     value = read_json(path)
     matrices = value.get("world_2_cam")
     if not isinstance(matrices, dict) or not matrices:

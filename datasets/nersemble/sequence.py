@@ -38,31 +38,21 @@ _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 
 @dataclass(frozen=True, eq=False)
 class RecordedView:
-    """The recording of one camera.
-
-    Attributes
-    ----------
-    serial : str
-        Serial number of the camera.
-    video : Path | None
-        The video, or None if the frames are image files.
-    images : Mapping[int, Path]
-        Image file by frame number; empty for a video.
-    count : int
-        Number of frames.
-    size : tuple[int, int]
-        (width, height).
-    mask_video, masks : Path | None, Mapping[int, Path]
-        Foreground coverage in the same form as the frames, if present.
-    """
+    """The recording of one camera."""
 
     serial: str
+    """Serial number of the camera."""
     video: Path | None = None
+    """The video, or None if the frames are image files."""
     images: Mapping[int, Path] = field(default_factory=dict)
+    """Image file by frame number; empty for a video."""
     count: int = 0
+    """Number of frames."""
     size: tuple[int, int] = (0, 0)
+    """(width, height)."""
     mask_video: Path | None = None
     masks: Mapping[int, Path] | None = None
+    """Foreground coverage in the same form as the frames, if present."""
 
     @property
     def has_masks(self) -> bool:
@@ -114,19 +104,10 @@ def read_sequence(
 ) -> RecordedSequence:
     """Inspect a sequence and check that it is complete.
 
-    Parameters
-    ----------
-    wanted : str
-        Its name or a unique prefix.
-    cameras : Sequence[str]
-        Serials; empty for all cameras of the calibration.
-    every : int | None
-        Frame stride: keep the frames whose number it divides. None keeps every third frame of videos
-        and of the 2023 frame folders, which have 73 frames per second, and all images of VHAP's
-        preprocessing (25 per second).
-    cut : bool
-        Whether to keep only the frames that all cameras have if they differ, instead of raising an
-        error.
+    ``wanted``: Its name or a unique prefix. ``cameras``: Serials; empty for all cameras of the calibration. ``every``:
+    Frame stride: keep the frames whose number it divides. None keeps every third frame of videos and of the 2023 frame
+    folders, which have 73 frames per second, and all images of VHAP's preprocessing (25 per second). ``cut``: Whether to
+    keep only the frames that all cameras have if they differ, instead of raising an error.
     """
     name = participant.match(wanted)
     folder = participant.sequences[name]
@@ -265,7 +246,7 @@ def probe_video(path: Path) -> tuple[int, tuple[int, int]]:
 
 
 def open_video(path: Path) -> cv2.VideoCapture:
-    """Open a video on one decoding thread, since streams run in parallel. Raises `InputError` on failure.
+    """Open a video on one decoding thread, since streams run in parallel.
 
     Pixels are read as stored, without the rotation in the file's metadata.
     """

@@ -23,12 +23,92 @@ import numpy as np
 import torch
 from scipy.linalg import eigh
 from scipy.sparse.linalg import LinearOperator, eigsh
+from scipy.spatial.transform import Rotation
 from sklearn.cluster import AgglomerativeClustering, KMeans, SpectralClustering
 
-from ...bench.contracts import Clip, FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.contracts import Clip, FloatArray, HeadAsset, HeadPose, IntArray, Progress, no_progress
 from ...bench.protocol import evenly_with_ends
 from ..head.arrays import region
-from ..head.subject import PosedSubject, pose_in_head_frame
+from ..head.model import PosedSubject, pose_in_head_frame
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+HALF_TURN = (0.0, 0.0, 0.0, 1.0)
+"""Real part first: half a turn about z. The published code intended the identity, with the real part last."""
+
+DEFAULT_COUNT = 16
+DISTINCT_ANGLE = np.radians(0.25)
+"""Rotations nearer than this, in radians, count as equal: a tenth of the jaw's smallest visible motion."""
+
+TGA_TEST_STRIDE = 16
+"""The published code takes every 16th test frame: with 16 cameras, each timestep once."""
+
+
+def leaks(variant: str) -> tuple[str, ...]:
+    """Description of the leak of test data, for records of results."""
+    return ("jaw bases drawn from held-out poses (published behaviour)",) if variant == "official" else ()
+
+
+def jaw_quaternions(poses: Sequence[HeadPose]) -> FloatArray:
+    """(N, 4) unit quaternions, real part first, of the poses' jaw rotations."""
+    rotations = Rotation.from_rotvec(np.array([pose.jaw for pose in poses], dtype=np.float64).reshape(-1, 3))
+    return rotations.as_quat()[:, [3, 0, 1, 2]]
+
+
+def farthest_quaternions(
+    candidates: FloatArray, seed: Sequence[float], count: int, *, tolerance: float = 0.0
+) -> FloatArray:
+    """Greedy farthest-point sampling by 1 - |<p, q>|, starting with ``seed``.
+
+    ``candidates``: (N, 4) unit quaternions, real part first. ``seed``: (4,) the first choice, included in ``count``.
+    ``tolerance``: Stop when no candidate is farther than this from the chosen ones.
+
+    Returns
+    -------
+    FloatArray
+        (n, 4), n at most ``count``: fewer if there are fewer distinct candidates.
+    """
+    chosen = [np.asarray(seed, dtype=np.float64)]
+    nearest = 1 - np.abs(candidates @ chosen[0][:, None])[:, 0]
+    while len(chosen) < count and nearest.size and nearest.max() > tolerance:
+        chosen.append(candidates[nearest.argmax()])
+        nearest = np.minimum(nearest, 1 - np.abs(candidates @ chosen[-1][:, None])[:, 0])
+    return np.array(chosen)
+
+
+def jaw_bases(
+    clip: Clip, count: int = DEFAULT_COUNT, *, variant: Literal["paper", "official"] = "paper"
+) -> FloatArray:
+    """Jaw bases of a clip, (n, 4) unit quaternions with the real part first, n <= ``count``.
+
+    There are fewer than ``count`` if the performance has fewer jaw rotations that differ by more than
+    `DISTINCT_ANGLE`.
+
+    ``variant``: "official" reproduces the published code: candidates are the poses of all novel-view frames and of every
+    16th self-reenactment frame (**a leak of the test signal**), seeded with `HALF_TURN`.
+    """
+    if variant == "official":
+        test = sorted(clip.splits["self_reenactment"], key=lambda key: (key.timestep, key.camera))
+        keys = [*sorted(clip.splits["novel_view"]), *test[::TGA_TEST_STRIDE]]
+        candidates = jaw_quaternions([clip.poses[key.timestep] for key in keys])
+        return farthest_quaternions(candidates, HALF_TURN, count)
+    timesteps = sorted({key.timestep for key in clip.splits["train"]})
+    candidates = jaw_quaternions([clip.poses[timestep] for timestep in timesteps])
+    # |<p, q>| is the cosine of half the angle between two rotations.
+    tolerance = 1 - np.cos(DISTINCT_ANGLE / 2)
+    return farthest_quaternions(candidates, IDENTITY, count, tolerance=tolerance)
+
+
+def jaw_weights(quaternions: FloatArray, bases: FloatArray) -> FloatArray:
+    """(N, n) weights of jaw rotations on the bases: |<q, q_i>| / sum_j |<q, q_j>|; rows sum to 1.
+
+    They hardly depend on the pose: the cosine of half an angle a is 1 - a^2 / 8, so for angles up to 0.2 rad from the bases all
+    weights lie within 0.5 % of 1 / n.
+
+    ``quaternions``: (N, 4) unit quaternions, real part first. ``bases``: (n, 4) output of `jaw_bases`.
+    """
+    likeness = np.abs(quaternions @ bases.T)
+    return likeness / likeness.sum(axis=1, keepdims=True)
+
 
 DEFAULT_CLASSES = 16
 LANDMARK_LIMIT = 500
@@ -42,30 +122,20 @@ _DIGITS = 6  # number of digits to which relative distances of one face are equa
 
 @dataclass(frozen=True, eq=False)
 class ExpressionClusters:
-    """Class of each training timestep.
-
-    Attributes
-    ----------
-    timesteps : IntArray
-        (T,) sorted training timesteps.
-    labels : IntArray
-        (T,) class of each, from 0; no class is empty.
-    medoids : IntArray
-        (classes,) timestep of each class that is nearest to its centre in the spectral embedding.
-    landmarks : int
-        Number of landmark timesteps; T if all pairs were compared.
-    radius : float
-        Metres within which every face has a landmark; 0 if all pairs were compared.
-    variant : str
-        "official" for the published behaviour.
-    """
+    """Class of each training timestep."""
 
     timesteps: IntArray
+    """(T,) sorted training timesteps."""
     labels: IntArray
+    """(T,) class of each, from 0; no class is empty."""
     medoids: IntArray
+    """(classes,) timestep of each class that is nearest to its centre in the spectral embedding."""
     landmarks: int
+    """Number of landmark timesteps; T if all pairs were compared."""
     radius: float
+    """Metres within which every face has a landmark; 0 if all pairs were compared."""
     variant: str = "paper"
+    """"official" for the published behaviour."""
 
     @property
     def by_timestep(self) -> dict[int, int]:
@@ -99,14 +169,9 @@ def cluster_expressions(
     Nyström method is used (see `spectral`); memory then grows with T times ``limit`` and T times the size of a face,
     never with T squared. There are never more classes than distinct faces (landmarks, beyond ``limit``).
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the first landmark, or of the random starts of "official"; unused for all pairs
-        otherwise.
-    variant : Literal['paper', 'official']
-        "official" reproduces the published code: all pairs regardless of their number, k-means from
-        ten random starts. Both use training timesteps only.
+    ``seed``: Seed of the first landmark, or of the random starts of "official"; unused for all pairs otherwise.
+    ``variant``: "official" reproduces the published code: all pairs regardless of their number, k-means from ten random
+    starts. Both use training timesteps only.
     """
     timesteps = np.array(sorted({key.timestep for key in clip.splits["train"]}))
     faces = expression_displacements(clip, timesteps.tolist())
@@ -132,15 +197,9 @@ def cluster_by_distance(
 ) -> tuple[IntArray, FloatArray]:
     """Spectral clustering with the similarity 1 - d / max d, from all pairs or only from distances to landmarks.
 
-    Parameters
-    ----------
-    distances : FloatArray
-        (N, N) symmetric, zero diagonal; or (N, m) of each item to each landmark. If the landmarks are
-        farthest points, the largest of these is the largest of all, up to the landmarks' radius.
-    classes : int
-        Maximum number of classes; fewer if there are fewer distinct items.
-    landmarks : IntArray | None
-        (m,) distinct indices of the landmarks.
+    ``distances``: (N, N) symmetric, zero diagonal; or (N, m) of each item to each landmark. If the landmarks are farthest
+    points, the largest of these is the largest of all, up to the landmarks' radius. ``classes``: Maximum number of classes;
+    fewer if there are fewer distinct items. ``landmarks``: (m,) distinct indices of the landmarks.
 
     Returns
     -------
@@ -198,7 +257,7 @@ def expression_displacements(clip: Clip, timesteps: Sequence[int]) -> FloatArray
     """(T, 3, F) float32 displacements of the face's F vertices from the neutral face, metres.
 
     Meshes have jaw, eyes and expression, but no rotation, neck and translation; vertices of the eye region have weight
-    `EYE_WEIGHT`. Raises `InputError` if the head has no region "face".
+    `EYE_WEIGHT`.
     """
     vertices, weights = _face_vertices(clip.head)
     subject = PosedSubject.of(clip, torch.float32)
@@ -236,14 +295,8 @@ def farthest_meshes(
     By the triangle inequality the distance of any two meshes differs from that of their landmarks by the sum of
     their distances to these, at most twice the radius. Memory grows with N times ``limit``, never with N squared.
 
-    Parameters
-    ----------
-    meshes : FloatArray
-        (N, 3, F) float32, N at least 1.
-    limit : int
-        Maximum number of landmarks.
-    tolerance : float
-        Stop when the radius is at most this fraction of the largest distance found.
+    ``meshes``: (N, 3, F) float32, N at least 1. ``limit``: Maximum number of landmarks. ``tolerance``: Stop when the radius
+    is at most this fraction of the largest distance found.
     """
     count = min(limit, len(meshes))
     columns = np.empty((count, len(meshes)), dtype=np.float32)
@@ -316,12 +369,8 @@ def nystrom_embedding(columns: FloatArray, landmarks: IntArray, classes: int) ->
     not be positive). Its diagonal is removed as that of the exact matrix is, and its eigenvectors are found by
     Lanczos iterations, so that they are orthogonal and nothing of size N squared is formed.
 
-    Parameters
-    ----------
-    columns : FloatArray
-        (N, m) similarity of each item to each landmark.
-    landmarks : IntArray
-        (m,) indices of the landmarks; m at least ``classes``.
+    ``columns``: (N, m) similarity of each item to each landmark. ``landmarks``: (m,) indices of the landmarks; m at least
+    ``classes``.
     """
     block = columns[landmarks]
     values, vectors = eigh(0.5 * (block + block.T))

@@ -44,12 +44,7 @@ def exclude_timesteps(
 ) -> CaptureClip:
     """Move the labelled timesteps of a clip from its splits to `excluded`, with their reasons.
 
-    Parameters
-    ----------
-    reasons : Mapping[int, str]
-        Label by timestep, such as {57: "tongue out"}.
-    source : str | PathLike[str]
-        Source of the reasons, named in the error.
+    ``reasons``: Label by timestep, such as {57: "tongue out"}. ``source``: Source of the reasons, named in the error.
     """
     unknown = sorted(set(reasons) - set(clip.poses))
     if unknown:
@@ -67,11 +62,7 @@ def exclude_timesteps(
 def exclude_given(clip: Clip, exclude: Mapping[int, str] | str | Path | None) -> CaptureClip:
     """Exclude the timesteps of a reader's setting ``exclude`` from a clip of any reader.
 
-    Parameters
-    ----------
-    exclude : Mapping[int, str] | str | Path | None
-        Reason by timestep, or a file for `read_reasons`, such as the one that ``headbench prepare tongue``
-        writes.
+    ``exclude``: Reason by timestep, or a file for `read_reasons`, such as the one that ``headbench prepare tongue`` writes.
     """
     from ..clip import as_capture  # slow to import
 
@@ -82,7 +73,7 @@ def exclude_given(clip: Clip, exclude: Mapping[int, str] | str | Path | None) ->
 
 
 def read_labels(path: Path) -> dict[int, str]:
-    """Read frame labels: a JSON object {"<timestep>": "<reason>"}. Raises `InputError` for other files."""
+    """Read frame labels: a JSON object {"<timestep>": "<reason>"}."""
     labels = {}
     for key, reason in read_json(path).items():
         if not (key.isascii() and key.isdigit() and isinstance(reason, str)):
@@ -140,27 +131,18 @@ class FrameDecision:
 
 @dataclass(frozen=True, eq=False)
 class Exclusions:
-    """Decisions on one subject.
-
-    Attributes
-    ----------
-    threshold : float
-        Minimum score of excluded frames.
-    basis : str
-        How the threshold was found.
-    cameras : tuple[str, ...]
-        Cameras that were evaluated.
-    frames : Mapping[int, FrameDecision]
-        Decision by timestep.
-    overrides : Mapping[int, str]
-        Manual decision by timestep: "keep", or the reason to exclude the frame.
-    """
+    """Decisions on one subject."""
 
     threshold: float
+    """Minimum score of excluded frames."""
     basis: str
+    """How the threshold was found."""
     cameras: tuple[str, ...]
+    """Cameras that were evaluated."""
     frames: Mapping[int, FrameDecision]
+    """Decision by timestep."""
     overrides: Mapping[int, str] = field(default_factory=dict)
+    """Manual decision by timestep: "keep", or the reason to exclude the frame."""
 
     def reasons(self) -> dict[int, str]:
         """Reason by excluded timestep, with overrides applied."""
@@ -208,7 +190,7 @@ class _File:
 
 
 def read_exclusions(path: Path) -> dict[str, Exclusions]:
-    """Read decisions by subject. Raises `InputError` for invalid files."""
+    """Read decisions by subject."""
     if not path.exists():
         remedy = "Create it with `headbench prepare tongue`."
         raise InputError(path, "", "a file of exclusions", "no such file", remedy)

@@ -17,11 +17,10 @@ from ...bench.contracts import ByteArray, Clip, FloatArray, FrameKey, HeadPose, 
 from ...bench.io.figures import pixels
 from ..clip import CaptureClip
 from ..figures import HELD_OUT, LEAK, MUTED, TRAIN, bands, new_figure, shortened, show
+from ..head.model import PosedSubject, pose_in_head_frame
 from ..head.rotations import rotation_of
-from ..head.subject import PosedSubject, pose_in_head_frame
 from ..mesh_pictures import draw_mesh, portrait_camera
-from .clusters import ExpressionClusters
-from .jaw_bases import DEFAULT_COUNT, jaw_bases, jaw_quaternions, jaw_weights, leaks
+from .clusters import DEFAULT_COUNT, ExpressionClusters, jaw_bases, jaw_quaternions, jaw_weights, leaks
 
 _YAW = 0.35  # radians; slightly from the side, to show the jaw's depth
 _MESH_SIZE = (268, 352)  # width, height, pixels

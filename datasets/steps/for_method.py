@@ -5,25 +5,211 @@ Found by the harness as the entry point of `headbench.adaptation`, see `headbenc
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
+from PIL import Image
 
-from ...bench.contracts import Clip, FloatArray, FrameKey, Progress
+from ...bench.contracts import Camera, Clip, FloatArray, FrameKey, Progress
 from ...bench.engine.adaptation import Adaptation, AdaptedClip, MethodNeeds
 from ...bench.errors import InputError
-from ..clip import CaptureClip, as_capture
+from ...bench.specs import ResolutionRule
+from ..clip import CaptureClip, FramePixels, as_capture
 from ..ga.tracking import find_head
 from ..head.arrays import HeadArrays
+from ..head.model import PosedSubject, camera_in_head_frame, pose_in_head_frame
 from ..head.procedural.model import procedural_head
 from ..head.procedural.versions import VERSIONS
 from ..head.refit.refit import refit
-from ..head.subject import PosedSubject, camera_in_head_frame, pose_in_head_frame
-from .resolution import align_clip, alignments
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Resize:
+    """Resizing to (width, height) pixels with the same extent."""
+
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class PixelBox:
+    """A box of an image in whole pixels, padded with background outside the image."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Pixel-exact conversion of images of one size to those of a `ResolutionRule`, and its inverse."""
+
+    source: Size
+    """(width, height) of the original images."""
+    moves: tuple[Resize | PixelBox, ...]
+    """Operations, applied in this order."""
+
+    @classmethod
+    def of(cls, source: Size, rule: ResolutionRule) -> Alignment:
+        """Apply a rule to an image size. Operations without effect are omitted.
+
+        A side that is not a multiple of the divisor is rounded down, which makes its pixels slightly larger.
+        """
+        moves: list[Resize | PixelBox] = []
+        width, height = source
+        if rule.square and width != height:
+            side = max(width, height) if rule.square == "pad" else min(width, height)
+            moves.append(PixelBox((width - side) // 2, (height - side) // 2, side, side))
+            width = height = side
+        if rule.divide > 1:
+            width, height = width // rule.divide, height // rule.divide
+            if min(width, height) < 1:
+                expected = f"images of at least {rule.divide} pixels on each side"
+                raise InputError("resolution rule", "divide", expected, f"{source[0]}x{source[1]}")
+            moves.append(Resize(width, height))
+        wanted = rule.size or (width * rule.multiply, height * rule.multiply)
+        if wanted != (width, height):
+            moves.append(Resize(*wanted))
+        return cls(source, tuple(moves))
+
+    @property
+    def aligned_size(self) -> Size:
+        """(width, height) of the aligned images."""
+        return (self.moves[-1].width, self.moves[-1].height) if self.moves else self.source
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera of the aligned images."""
+        _check_size(f"camera {camera.id}", self.source, (camera.width, camera.height))
+        for move in self.moves:
+            if isinstance(move, Resize):
+                camera = camera.resized(move.width, move.height)
+            else:
+                camera = camera.boxed(move.left, move.top, move.width, move.height)
+        return camera
+
+    def image(self, image: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
+        """Align a composited float32 image (H, W, 3) in [0, 1]; boxes are padded with ``background``.
+
+        Coverage is aligned the same way as (H, W, 1) on background 0.
+        """
+        _check_size("image", self.source, (image.shape[1], image.shape[0]))
+        for move in self.moves:
+            if isinstance(move, Resize):
+                image = _resized(image, move.width, move.height)
+            else:
+                image = take_box(image, move, background)
+        return image
+
+    def restore(self, render: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
+        """Convert an (H, W, 3) render of the aligned view to the source's size, in one antialiased resizing.
+
+        Cropped parts become ``background``.
+        """
+        _check_size("render", self.aligned_size, (render.shape[1], render.shape[0]))
+        boxes = [move for move in self.moves if isinstance(move, PixelBox)]
+        box = boxes[0] if boxes else PixelBox(0, 0, *self.source)
+        whole = _resized(np.asarray(render, np.float32), box.width, box.height)
+        return take_box(whole, PixelBox(-box.left, -box.top, *self.source), background)
+
+
+def take_box(image: FloatArray, box: PixelBox, background: Sequence[float] | FloatArray) -> FloatArray:
+    """Crop a box from an image (H, W, C), padded with (C,) ``background``."""
+    height, width = image.shape[:2]
+    if (box.left, box.top, box.width, box.height) == (0, 0, width, height):
+        return image
+    result = np.empty((box.height, box.width, image.shape[2]), dtype=image.dtype)
+    result[:] = np.asarray(background, dtype=image.dtype)
+    left, right = max(box.left, 0), min(box.left + box.width, width)
+    top, bottom = max(box.top, 0), min(box.top + box.height, height)
+    if left < right and top < bottom:
+        inside = (slice(top - box.top, bottom - box.top), slice(left - box.left, right - box.left))
+        result[inside] = image[top:bottom, left:right]
+    return result
+
+
+def alignments(cameras: Mapping[str, Camera], rule: ResolutionRule) -> dict[str, Alignment]:
+    """Alignment of each camera's images, by camera id."""
+    return {name: Alignment.of((c.width, c.height), rule) for name, c in cameras.items()}
+
+
+def align_clip(clip: CaptureClip, rule: ResolutionRule) -> CaptureClip:
+    """The clip at the size of a rule: images and masks resized when they are read, intrinsics with them.
+
+    The composited image is resized instead of straight colours, because colours with zero coverage are arbitrary and
+    must not bleed into edges. A clip that a rule does not change is returned unchanged.
+    """
+    plans = alignments(clip.cameras, rule)
+    if not any(plan.moves for plan in plans.values()):
+        return clip
+    cameras = {name: plans[name].camera(camera) for name, camera in clip.cameras.items()}
+    recorded = {clip.recorded(key).camera: key.camera for key in clip.files}
+    by_recorded = {name: plans[current] for name, current in recorded.items()}
+    ground = np.asarray(clip.background, dtype=np.float32)
+
+    def align(key: FrameKey, pixels: FramePixels) -> FramePixels:
+        plan = by_recorded[key.camera]
+        coverage = pixels.coverage
+        if coverage is not None:
+            coverage = plan.image(coverage[..., None], (0.0,))[..., 0]
+        return FramePixels(plan.image(pixels.image, ground), coverage)
+
+    pairs = sorted({(plan.source, plan.aligned_size) for plan in plans.values()})
+    sizes = [f"{a[0]}x{a[1]} to {b[0]}x{b[1]}" for a, b in pairs]
+    parameters = {"rule": asdict(rule), "sizes": sizes}
+    return clip.derive_pixels("align_resolution", parameters, align, cameras=cameras)
+
+
+def _resized(image: FloatArray, width: int, height: int) -> FloatArray:
+    if (image.shape[1], image.shape[0]) == (width, height):
+        return image
+    return np.clip(resize_image(image, width, height), 0, 1)
+
+
+def _check_size(what: str, expected: Size, found: Size) -> None:
+    if expected != found:
+        raise InputError(what, "size", f"{expected[0]}x{expected[1]}", f"{found[0]}x{found[1]}")
+
+
+MAX_SIDE = 32767
+"""Maximum side of an image, the limit of OpenCV's resizing."""
+
+
+def resize_image(image: FloatArray, width: int, height: int) -> FloatArray:
+    """Resize a float32 image (H, W) or (H, W, C).
+
+    If both sides shrink by whole factors, every pixel is the mean of its block. Otherwise the kernel is
+    Keys' cubic (a = -1/2, "Cubic convolution interpolation for digital image processing", 1981), widened by the factor
+    when a side shrinks, to avoid aliasing; it reproduces linear ramps and overshoots at edges by up to some per cent,
+    so clamp if necessary. Weights outside the image are dropped and the rest renormalised.
+    """
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise InputError("resize", "size", f"sides of 1 to {MAX_SIDE} pixels", f"{width}x{height}")
+    if image.dtype != np.float32 or image.ndim not in (2, 3) or 0 in image.shape:
+        found = f"{image.dtype} of shape {image.shape}"
+        raise InputError("resize", "image", "float32 of shape (H, W) or (H, W, C)", found)
+    rows, columns = image.shape[:2]
+    if (rows, columns) == (height, width):
+        return image
+    if rows % height == 0 and columns % width == 0:
+        means = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        return np.asarray(means, dtype=np.float32).reshape(height, width, *image.shape[2:])
+    planes = image[..., None] if image.ndim == 2 else image
+    resized = [_cubic(planes[..., channel], width, height) for channel in range(planes.shape[2])]
+    return resized[0] if image.ndim == 2 else np.stack(resized, axis=-1)
+
+
+def _cubic(plane: FloatArray, width: int, height: int) -> FloatArray:
+    # Pillow's bicubic is Keys' with a = -1/2 and widens when shrinking; OpenCV's (a = -3/4) bends ramps and aliases.
+    source = Image.fromarray(np.ascontiguousarray(plane))
+    return np.asarray(source.resize((width, height), Image.Resampling.BICUBIC), dtype=np.float32)
 
 
 def clip_for_method(source: Clip, needs: MethodNeeds, heads: Mapping[str, str]) -> Adaptation:

@@ -20,7 +20,7 @@ from ...bench.errors import InputError
 from ...bench.io.files import digest, digest_file
 from ...bench.io.images import read_pixels
 from ..clip import CaptureClip, FramePixels
-from ..head.subject import PosedSubject
+from ..head.model import PosedSubject
 
 Ground = Sequence[float] | FloatArray
 """A colour (3,) in [0, 1], or an image (H, W, 3) of the empty set."""
@@ -52,7 +52,7 @@ def recomposite(image: FloatArray, coverage: FloatArray, old: Ground, new: Groun
 
 
 def set_background(clip: CaptureClip, background: Sequence[float]) -> CaptureClip:
-    """The clip on another background. Raises `InputError` if a frame has no mask."""
+    """The clip on another background."""
     colour = check_colour(background)
     if np.array_equal(colour, clip.background):
         return clip
@@ -94,8 +94,6 @@ def mask_below_neck(clip: CaptureClip) -> CaptureClip:
 
     The line goes through the projected front of the neck's lower boundary, parallel to the line through its left
     and right; its edge is Gaussian. Head models end there and do not explain the motion of clothes below it.
-
-    Raises `InputError` if the head model has no region "boundary" or "neck".
     """
     anchors = neck_anchors(clip.head)
     timesteps = sorted({key.timestep for key in clip.files})
@@ -124,12 +122,8 @@ def mask_clothes(
 ) -> CaptureClip:
     """Replace clothes, and what is no part of the person, by background, in images and masks.
 
-    Parameters
-    ----------
-    labels : Mapping[FrameKey, Path]
-        Image of each frame with the labels of CelebAMask-HQ's 19 classes.
-    view : Callable[[ByteArray], ByteArray] | None
-        The part of an image of coverage that a frame of the clip shows; None for all of it.
+    ``labels``: Image of each frame with the labels of CelebAMask-HQ's 19 classes. ``view``: The part of an image of
+    coverage that a frame of the clip shows; None for all of it.
     """
     ground = np.asarray(clip.background, dtype=np.float32)
     files = {clip.recorded(key): labels[key] for key in clip.files}
@@ -151,7 +145,7 @@ NO_PERSON, CLOTH, CLASSES = 0, 16, 19
 
 
 def read_labels(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
-    """(H, W) labels of an image of `CLASSES` labels. Raises `InputError` for another image, or another (width, height)."""
+    """(H, W) labels of an image of `CLASSES` labels."""
     pixels = read_pixels(path, size)
     if pixels.ndim != 2 or pixels.max() >= CLASSES:
         expected = f"a grey 8-bit image of labels from 0 to {CLASSES - 1}, as face-parsing.PyTorch gives them"
@@ -174,7 +168,7 @@ def without_torso(
 
 
 def label_files(clip: CaptureClip, parsing: str) -> dict[FrameKey, Path]:
-    """Label image of each frame in the folder ``parsing``, named as its image. Raises `InputError` as `read_labels`."""
+    """Label image of each frame in the folder ``parsing``, named as its image."""
     images = {key: files.image for key, files in clip.files.items()}
     labels = {key: Path(parsing) / f"{path.stem}.png" for key, path in images.items() if path is not None}
     for path in labels.values():

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ...bench.contracts import Progress
 from ...bench.engine.config import (
@@ -16,7 +17,14 @@ from ...bench.io.files import (
     check_output_folder,
 )
 from ...bench.io.lock import locked
-from ...bench.specs import CommandResult, command
+from ...bench.specs import CommandResult, Need, command
+
+
+def needs(config: Any, device: str) -> Iterator[Need]:
+    """The kernel that renders the pictures."""
+    from .panels import KERNEL
+
+    yield KERNEL.need()
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...bench.contracts import FloatArray, IntArray
-from ..head.geometry import smoothstep
-from .anatomy import SIDES, Anatomy, Eye, Person
-from .fields import fractal_noise, value_noise
-from .skin import beard_share, brow_color, brow_curve
+from ...bench.contracts import FloatArray, HeadAsset, IntArray
+from ..head.geometry import LENGTH_BITS, mesh_edges, on_grid, smoothstep, vertex_normals
+from .anatomy import SIDES, Anatomy, Eye, Person, fractal_noise, value_noise
+from .skin import beard_share, brow_color, brow_curve, sagging
 
 
 @dataclass(frozen=True)
@@ -263,20 +262,10 @@ def ribbons(
 ) -> Strands:
     """Tapered ribbons around paths (n, k, 3).
 
-    Parameters
-    ----------
-    outward : FloatArray
-        (n, k, 3) or (n, 1, 3) direction that a ribbon's flat side faces.
-    width : FloatArray
-        (n,) metres, at the widest.
-    color : FloatArray
-        (n, c, 3) linear reflectance across each ribbon, c >= 2 columns.
-    tip_shade : float
-        Factor on the colour at the tip (above 1 for sun-bleached tips).
-    tip_width, root_width : float
-        Width at the ends relative to the widest.
-    arch : float
-        Height of the middle above the edges, relative to the width.
+    ``outward``: (n, k, 3) or (n, 1, 3) direction that a ribbon's flat side faces. ``width``: (n,) metres, at the widest.
+    ``color``: (n, c, 3) linear reflectance across each ribbon, c >= 2 columns. ``tip_shade``: Factor on the colour at the
+    tip (above 1 for sun-bleached tips). ``tip_width``, ``root_width``: Width at the ends relative to the widest. ``arch``:
+    Height of the middle above the edges, relative to the width.
     """
     count, points = paths.shape[:2]
     columns = color.shape[1]
@@ -441,3 +430,46 @@ def make_beard(
     facing = normal[:, None] + rng.normal(0.0, 0.25, (count, 1, 3))
     width = 0.0024 * fine * s * rng.uniform(0.7, 1.3, count)
     return RootedStrands(ribbons(paths, facing, width, color, tip_shade=1.2, tip_width=0.3), root)
+
+
+FOUND = 0.8
+"""Fraction of the thickness in the offset, which penalties reduce."""
+_ROUNDS = 6  # of averaging over neighbours
+_LOCKS = 0.6  # mean height of locks over the cap, as a part of their rise
+_BEARD = 0.35  # mean thickness of a beard, as a part of its length
+
+
+def tracked_volume(person: Person, anatomy: Anatomy, head: HeadAsset, neutral: FloatArray) -> FloatArray:
+    """(V, 3) offsets, metres, of a subject's neutral vertices (V, 3); 0 without skin. Joints do not move."""
+    s, style = anatomy.scale, STYLES[person.style]
+    named = np.zeros(len(neutral))
+    for ear in ("left_ear", "right_ear"):
+        named[head.regions.get(ear, [])] = 1.0
+    thickness = (
+        (style.cap + _LOCKS * style.rise)
+        * s
+        * hair_share(person, anatomy, neutral, ear_share(anatomy, neutral, named))
+    )
+    thickness = thickness + _BEARD * person.beard * s * beard_share(person, anatomy, neutral)
+    thickness = thickness + sagging(person, anatomy, neutral)
+    skin = np.zeros(len(neutral), bool)
+    skin[anatomy.skin_faces] = True
+    offset = FOUND * np.where(skin, thickness, 0.0)[:, None] * vertex_normals(neutral, anatomy.skin_faces)
+    return without_joints(head, smoothed(offset, anatomy.skin_faces, _ROUNDS) * skin[:, None])
+
+
+def smoothed(values: FloatArray, faces: IntArray, rounds: int) -> FloatArray:
+    """(V, n) values at vertices, averaged ``rounds`` times with those of their neighbours."""
+    edges = mesh_edges(faces)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    around = np.bincount(both[:, 0], minlength=len(values))
+    for _ in range(rounds):
+        mean = [np.bincount(both[:, 0], column[both[:, 1]], len(values)) for column in values.T]
+        values = 0.5 * (values + np.stack(mean, axis=1) / np.maximum(around, 1)[:, None])
+    return values
+
+
+def without_joints(head: HeadAsset, offset: FloatArray) -> FloatArray:
+    """(V, 3) offsets with the least change that leaves the joints, which are regressed from these vertices, in place."""
+    regressor = np.asarray(head.joint_regressor, np.float64)
+    return on_grid(offset - np.linalg.pinv(regressor) @ (regressor @ offset), LENGTH_BITS)

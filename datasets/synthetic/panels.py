@@ -19,7 +19,7 @@ import numpy as np
 from ...bench.contracts import Camera, FloatArray, IntArray
 from ...bench.errors import InputError
 from ...bench.native.dispatch import Kernel
-from ..rounding import ANGLE_BITS, COEFFICIENT_BITS, LENGTH_BITS, on_grid
+from ..head.geometry import ANGLE_BITS, COEFFICIENT_BITS, LENGTH_BITS, on_grid
 from .plan import CAMERA_DISTANCE
 
 KERNEL = Kernel("headbench.datasets.synthetic._light", "The renderer of synthetic captures")
@@ -159,12 +159,8 @@ def window(camera: Camera, points: FloatArray) -> tuple[slice, slice]:
 class PanelTracer:
     """A scene lit by panels; meshes have constant triangles and may change positions and colours.
 
-    Parameters
-    ----------
-    samples : int
-        Rays per pixel, rounded up to a square number.
-    seed : int
-        Seed of the points on the panels that each vertex samples.
+    ``samples``: Rays per pixel, rounded up to a square number. ``seed``: Seed of the points on the panels that each vertex
+    samples.
     """
 
     def __init__(

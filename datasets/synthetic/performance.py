@@ -16,9 +16,9 @@ from scipy.optimize import nnls
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose
 from ...bench.errors import InputError
+from ..head.geometry import COEFFICIENT_BITS, on_grid
 from ..head.procedural.expressions import SEMANTIC_NAMES
 from ..head.procedural.versions import semantic_to_coefficients
-from ..rounding import COEFFICIENT_BITS, on_grid
 from . import natural
 from .anatomy import SIDES
 from .natural import SPEECH, Curves, Face, both

@@ -16,13 +16,12 @@ from ...bench.errors import InputError
 from ...bench.io.files import digest
 from ..ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from ..head.arrays import HeadArrays
-from ..head.geometry import smoothstep
+from ..head.geometry import ANGLE_BITS, COEFFICIENT_BITS, LENGTH_BITS, on_grid, smoothstep
 from ..head.ict import expression_names, ict_head, is_ict, read_ict
 from ..head.model import HeadModel
 from ..head.procedural.model import procedural_head
-from ..rounding import ANGLE_BITS, COEFFICIENT_BITS, LENGTH_BITS, on_grid
 from .anatomy import HAIR, IRIS, SKIN, Anatomy, Person, linear, measure
-from .hair import STYLES, Style
+from .hair import STYLES, Style, tracked_volume
 from .parts import MouthPart, procedural_parts, share_that_shows, tongue
 from .performance import (
     HELD_OUT,
@@ -37,7 +36,6 @@ from .performance import (
     share_out,
 )
 from .tracking import Tracker, with_tracking_error, with_tracking_noise
-from .volume import tracked_volume
 
 AGES = (20.0, 78.0)
 _GREY = "#c4c0ba"

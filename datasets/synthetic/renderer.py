@@ -3,20 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from ...bench.contracts import BoolArray, ByteArray, Camera, FloatArray, HeadPose, IntArray
-from ..rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
-from .fields import fractal_noise
-from .history import SkinState, over_time
-from .lag import follow
-from .panels import PanelTracer, panels, rig_middle
+from ...bench.contracts import BoolArray, ByteArray, Camera, Clip, FloatArray, HeadPose, IntArray, TrueFrame
+from ...bench.engine.captures import synthesis_arguments
+from ...bench.errors import UnavailableError
+from ...bench.io.files import digest
+from ..clip import HeadRegions, select
+from ..head.geometry import COEFFICIENT_BITS, LENGTH_BITS, on_grid
+from .anatomy import fractal_noise
+from .history import SkinState, follow, over_time
+from .panels import KERNEL, PanelTracer, default_samples, panels, rig_middle, sample_count
 from .performance import CONTROLS, Activations, at_moments
-from .plan import CAMERA_DISTANCE, FRONTAL, SERIALS, SubjectPlan
+from .plan import (
+    CAMERA_DISTANCE,
+    EDITION,
+    FIRST_SUBJECT,
+    FRONTAL,
+    PROCEDURAL,
+    SERIALS,
+    SubjectPlan,
+    SyntheticSettings,
+    load_geometry,
+    plan_subject,
+)
 from .subject import LatePoses, RenderedSubject
 
 SHUTTER_SECONDS = 0.003
@@ -103,14 +119,8 @@ def _distance(covered: BoolArray) -> FloatArray:
 def matte(alpha: FloatArray, hair: FloatArray, level: float, metre: float, seed: int) -> FloatArray:
     """(H, W) coverage as a matting network gives it: at ``hair`` (H, W) without single hairs, and displaced.
 
-    Parameters
-    ----------
-    alpha : FloatArray
-        (H, W) coverage.
-    level : float
-        The outline of hair is displaced by up to `MATTE_METRES` times this; below 1, it also keeps a part of its hairs.
-    seed : int
-        Of the field that displaces.
+    ``alpha``: (H, W) coverage. ``level``: The outline of hair is displaced by up to `MATTE_METRES` times this; below 1, it
+    also keeps a part of its hairs. ``seed``: Of the field that displaces.
     """
     reach = _SOFT * metre
     core = _distance(alpha <= 0.5) > reach
@@ -259,3 +269,103 @@ class CaptureRenderer:
 
     def _pose(self, activations: Activations) -> HeadPose:
         return self._plan.geometry.translation.pose(activations, self._plan.person.name, None)
+
+
+_HELD_SECONDS = 60.0
+
+
+class SyntheticTruth:
+    """The person of a synthetic capture, rendered in any pose and view; a `GroundTruth`.
+
+    Shape, skin, hair, lights, samples a pixel, tone curve and errors of masks are the capture's, the
+    background is the clip's. Blood flow and wrinkles are in the steady state of the expression, and the tongue is inside.
+    Effects that depend on time (`--hair-lag`, `--motion-blur`) and the response of single cameras (`--camera-colour`) are
+    left out.
+
+    The pose is taken as it is. If the capture's tracking has errors, an avatar that was trained with them is compared with
+    the true person in the pose that it is given, not with the pictures that were tracked as that pose.
+
+    Attributes
+    ----------
+    fingerprint : str
+        Hex digest of everything that a picture depends on beside pose and camera.
+    """
+
+    def __init__(self, clip: Clip) -> None:
+        self._posed: HeadPose | None = None
+        self._subject, self._background = clip.subject, np.asarray(clip.background, np.float64)
+        self._settings = _settings(clip)
+        KERNEL.load()
+        self._geometry = load_geometry(self._settings.head)
+        made = self._geometry.head.version
+        if clip.head.version != made:
+            raise UnavailableError(
+                f"The clip has poses of {clip.head.version}; the true person is rendered in poses of {made}.",
+                "Make the capture with that head model (`headbench synth --head`).",
+                f"poses are of {clip.head.version}, the truth is of {made}",
+            )
+        self.fingerprint = digest(
+            asdict(self._settings), EDITION, clip.subject, self._geometry.head.fingerprint(), self._background
+        )
+
+    def render(self, camera: Camera, pose: HeadPose, seed: int = 0) -> TrueFrame:
+        """Picture of the person, the same bytes for the same input. ``seed`` is that of the samples of the pixels."""
+        if pose is not self._posed:  # light is computed once for all views of a pose
+            activations = self._geometry.translation.activations(pose)
+            (skin,) = over_time([activations], _HELD_SECONDS, self._plan.person)
+            self._renderer.set_pose(pose, activations, skin)
+            self._posed = pose
+        rgb, mask = self._renderer.render_view(camera, seed, self._background)
+        return TrueFrame(rgb, mask, select(self._regions.labels(camera, pose, mask), "face"))
+
+    def depth(self, camera: Camera, pose: HeadPose) -> FloatArray:
+        """(H, W) distance of the head's mesh along the camera's axis, metres; infinity beside it. Hair, beard and glasses have none."""
+        return self._regions.depth(camera, pose)
+
+    @cached_property
+    def _plan(self) -> SubjectPlan:
+        index = int(self._subject) - FIRST_SUBJECT
+        return plan_subject(Path("unwritten"), index, self._geometry, self._settings)
+
+    @cached_property
+    def _regions(self) -> HeadRegions:
+        return HeadRegions(self._geometry.head, self._plan.shape, self._plan.writer.plan.static_offset)
+
+    @cached_property
+    def _renderer(self) -> CaptureRenderer:
+        return CaptureRenderer(self._plan)
+
+
+def _settings(clip: Clip) -> SyntheticSettings:
+    """Settings that a clip's capture was made with. Raises `UnavailableError` if they cannot be reproduced."""
+    recorded = clip.steps[0].parameters.get("synthetic") if clip.steps else None
+    if not recorded:
+        raise UnavailableError(
+            f"Subject {clip.subject} is recorded; only a synthetic capture has a truth for every pose and view.",
+            "Use a capture of `headbench synth`.",
+            "the capture is not synthetic",
+        )
+    if any(step.name == "mask_below_neck" for step in clip.steps):
+        raise UnavailableError(
+            "The clip's pictures are cut off below the neck; the truth shows the shoulders.",
+            "Read the capture with its shoulders (`below_neck`).",
+            "the pictures are cut off below the neck",
+        )
+    if recorded.get("edition") != EDITION:
+        raise UnavailableError(
+            f"The capture is of edition {recorded.get('edition', 1)}; this version renders edition {EDITION}.",
+            "Make the capture again with this version (`headbench synth`).",
+            f"the capture is of edition {recorded.get('edition', 1)}, not {EDITION}",
+        )
+    if recorded.get("head") not in PROCEDURAL:
+        raise UnavailableError(
+            f"The capture has the head model {recorded.get('head')}, whose file it does not name.",
+            "Use a capture of the procedural head.",
+            "the capture is not of the procedural head",
+        )
+    given = synthesis_arguments([asdict(step) for step in clip.steps], clip.subject)
+    size = given["size"]
+    wanted = given["samples_per_pixel"]
+    values = {field.name: given[field.name] for field in fields(SyntheticSettings)}
+    samples = default_samples(*size) if wanted is None else sample_count(wanted)
+    return SyntheticSettings(**{**values, "size": (size[0], size[1]), "samples_per_pixel": samples})

@@ -13,8 +13,18 @@ from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray
 from ..head.geometry import smoothstep
-from .anatomy import SIDES, Anatomy, Person
-from .fields import blob, fractal_noise, polygon_distance, polyline_distance, smooth_curve, spots, value_noise
+from .anatomy import (
+    SIDES,
+    Anatomy,
+    Person,
+    blob,
+    fractal_noise,
+    polygon_distance,
+    polyline_distance,
+    smooth_curve,
+    spots,
+    value_noise,
+)
 from .performance import Activations
 
 _FRONT = 0.35  # z component of the normal from which on a point counts as facing front

@@ -11,20 +11,26 @@ from scipy.spatial import cKDTree
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ..head.arrays import HeadArrays, region
-from ..head.geometry import smoothstep, triangle_areas, unique_pairs, vertex_normals
+from ..head.geometry import LENGTH_BITS, on_grid, smoothstep, triangle_areas, unique_pairs, vertex_normals
 from ..head.model import HeadModel, joint_motions
 from ..head.rotations import axis_angle_to_matrix
-from ..rounding import LENGTH_BITS, on_grid
-from .anatomy import SIDES, Anatomy, Person, linear, measure
-from .fields import smooth_curve, value_noise
-from .hair import STYLES, RootedStrands, Strands, ear_share, make_beard, make_brows_and_lashes, make_hair
-from .history import SkinState
-from .lag import FREE_LENGTH, NECK_SHARE
+from .anatomy import SIDES, Anatomy, Person, linear, measure, smooth_curve, value_noise
+from .hair import (
+    STYLES,
+    RootedStrands,
+    Strands,
+    ear_share,
+    make_beard,
+    make_brows_and_lashes,
+    make_hair,
+    smoothed,
+    without_joints,
+)
+from .history import FREE_LENGTH, NECK_SHARE, SkinState
 from .parts import eye_mesh, tracked_parts
 from .performance import EXPRESSION_CONTROLS, Activations, Translation
 from .plan import Geometry
 from .skin import gloss_at_rest, make_folds, paint_skin, sagging
-from .volume import smoothed, without_joints
 
 _SIDES_OF_TUBE = 8
 _WRAP = 3.0  # 1/m: how the front bends around the face
@@ -226,12 +232,8 @@ class LatePoses:
 class RenderedSubject:
     """A subject's visible body over a head model.
 
-    Parameters
-    ----------
-    shape : FloatArray
-        (S,) identity coefficients.
-    correctives : float
-        Level of shapes of the skin that the head model lacks, see `correctives`.
+    ``shape``: (S,) identity coefficients. ``correctives``: Level of shapes of the skin that the head model lacks, see
+    `correctives`.
     """
 
     def __init__(
@@ -425,27 +427,18 @@ ROUNDING = 0.6  # share of the full projection; Boubekeur and Alexa use 3/4
 
 @dataclass(frozen=True, eq=False)
 class FineMesh:
-    """Points bound to the triangles of a tracked mesh.
-
-    Attributes
-    ----------
-    faces : IntArray
-        (F', 3) triangles over the fine points.
-    parents : IntArray
-        (N, 3) vertex indices into the tracked mesh.
-    weights : FloatArray
-        (N, 3) barycentric weights, rows sum to 1.
-    parent_faces : IntArray
-        (N,) tracked triangle a point lies on (one of them for points on an edge).
-    coarse_faces : IntArray
-        (F, 3) the tracked triangles that were refined.
-    """
+    """Points bound to the triangles of a tracked mesh."""
 
     faces: IntArray
+    """(F', 3) triangles over the fine points."""
     parents: IntArray
+    """(N, 3) vertex indices into the tracked mesh."""
     weights: FloatArray
+    """(N, 3) barycentric weights, rows sum to 1."""
     parent_faces: IntArray
+    """(N,) tracked triangle a point lies on (one of them for points on an edge)."""
     coarse_faces: IntArray
+    """(F, 3) the tracked triangles that were refined."""
 
     def interpolate(self, values: FloatArray) -> FloatArray:
         """Values at the tracked vertices, (V, ...) -> at the fine points, (N, ...)."""
@@ -472,14 +465,8 @@ class FineMesh:
 def refine(vertices: FloatArray, faces: IntArray, target: FloatArray) -> FineMesh:
     """Split the edges longer than wanted, conformingly, at most `_ROUNDS` times.
 
-    Parameters
-    ----------
-    vertices : FloatArray
-        (V, 3) tracked mesh at rest, metres.
-    faces : IntArray
-        (F, 3) triangles to refine; unused vertices are left out.
-    target : FloatArray
-        (V,) longest edge wanted around each vertex, metres.
+    ``vertices``: (V, 3) tracked mesh at rest, metres. ``faces``: (F, 3) triangles to refine; unused vertices are left out.
+    ``target``: (V,) longest edge wanted around each vertex, metres.
     """
     used, local = np.unique(faces, return_inverse=True)
     triangles: IntArray = local.reshape(faces.shape).astype(np.int64)

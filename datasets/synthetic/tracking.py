@@ -23,8 +23,8 @@ from scipy.optimize import nnls
 from ...bench.contracts import FloatArray, HeadPose
 from ...bench.protocol import evenly_with_ends
 from ..head.arrays import HeadArrays, region
+from ..head.geometry import COEFFICIENT_BITS, on_grid, share_left
 from ..head.model import HeadModel
-from ..rounding import COEFFICIENT_BITS, on_grid, share_left
 from .anatomy import SIDES
 from .performance import EXPRESSION_CONTROLS, Activations, Translation
 
@@ -92,17 +92,10 @@ def with_tracking_error(
 ) -> dict[str, list[HeadPose]]:
     """Poses with simulated tracking errors; drift is independent in each sequence.
 
-    Parameters
-    ----------
-    sequences, activations, translation : Mapping[str, Sequence[HeadPose]], Mapping[str, Sequence[Activations]], Translation
-        Exact poses, the controls that made them, and the conversion between them.
-    level : float
-        0 returns the poses unchanged; 1 displaces the face by 0.5 to 1 mm, lips and lids by about
-        `DETAIL_MM` or `VIDEO_DETAIL_MM`, and so on in proportion.
-    tracker : Tracker
-        Whether errors drift from timestep to timestep or in time.
-    steps : Mapping[str, float] | None
-        Seconds between timesteps of each sequence, for a tracker of videos.
+    ``sequences``, ``activations``, ``translation``: Exact poses, the controls that made them, and the conversion between
+    them. ``level``: 0 returns the poses unchanged; 1 displaces the face by 0.5 to 1 mm, lips and lids by about `DETAIL_MM`
+    or `VIDEO_DETAIL_MM`, and so on in proportion. ``tracker``: Whether errors drift from timestep to timestep or in time.
+    ``steps``: Seconds between timesteps of each sequence, for a tracker of videos.
     """
     if level == 0.0:
         return {name: list(each) for name, each in sequences.items()}

@@ -73,7 +73,7 @@ class ImportTrackingSettings:
 
 if TYPE_CHECKING:
     from ..clip import CaptureClip
-    from .pictures import VideoPictures
+    from .frames import VideoPictures
 
 REPORT, PICTURE = "import.json", "overlay.png"
 SHOWN = 6
@@ -85,20 +85,17 @@ def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_pr
     """Make a capture from the files of another tracker and the frames of the video.
 
     Writes under ``settings.out`` ``overlay.png`` with the mesh over a few images, the capture (PNG images without separate
-    masks are linked, others are composited on white), and ``import.json``. Raises `InputError` for files that cannot be
-    read and for images that do not belong to them, before anything is written.
+    masks are linked, others are composited on white), and ``import.json``.
     """
     from ..clip import check_apart
     from ..head.refit.command import target_head
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
+    from ..inspect.figure import draw_overlay
     from ..monocular.clip import clip_of_track, subject_of
-    from ..overlay import draw_overlay
     from ..steps.masks import without_torso
     from .formats import recognise
-    from .frames import FOLDER, frame_files, read_frames
-    from .pictures import find_pictures
-    from .video import left_out, video_track
+    from .frames import FOLDER, find_pictures, frame_files, left_out, read_frames, video_track
 
     root, out = Path(settings.source), Path(settings.out)
     if not settings.format:

@@ -15,12 +15,11 @@ from ...bench.manifest import cut_of
 from ...bench.progress import counted
 from ...bench.protocol import evenly_with_ends
 from ...bench.specs import CommandResult, command
-from .settings import TrackSettings
-from .work import WORK, check_work_folder, make_work_folder
+from .settings import WORK, TrackSettings, check_work_folder, make_work_folder
 
 if TYPE_CHECKING:
-    from ..tracking_errors import RegionError
-    from .track import Tracked
+    from .track import RegionError, Tracked
+
 
 REPORT, PICTURE = "track.json", "overlay.png"
 ROWS, COLUMNS = 3, 4
@@ -33,8 +32,8 @@ ROWS, COLUMNS = 3, 4
     writes="out",
     kinds=("captures",),
     programs={
-        "vhap": "headbench.datasets.tracking.needs:vhap",
-        "pixel3dmm": "headbench.datasets.tracking.needs:pixel3dmm",
+        "vhap": "headbench.datasets.tracking.programs:vhap",
+        "pixel3dmm": "headbench.datasets.tracking.programs:pixel3dmm",
     },
 )
 def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> CommandResult:
@@ -42,19 +41,17 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
 
     Writes under ``settings.out`` the capture (images linked), ``track.json`` with every timestep's residuals and
     ``overlay.png``. Intermediate results are stored there, so that an interrupted call can be resumed.
-    Raises `InputError` before the fit for a capture that cannot be tracked or written.
     """
     from ..clip import check_apart
     from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
-    from ..overlay import draw_overlay
+    from ..inspect.figure import draw_overlay
     from ..steps.masks import label_files, without_torso
-    from ..tracking_errors import tracking_errors
     from ..video.command import video_to_track
     from ..video.decode import is_video
-    from .external import track_with_program
-    from .network import landmark_source
-    from .track import LandmarkSource, check_cameras, track
+    from .landmarks import landmark_source
+    from .programs import track_with_program
+    from .track import LandmarkSource, check_cameras, track, tracking_errors
 
     if settings.fetch_networks:
         files = fetch_networks()

@@ -10,13 +10,87 @@ import cv2
 import numpy as np
 from scipy.sparse import csr_array
 
-from ...bench.contracts import FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.contracts import Camera, FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError
-from .images import FrameStack
 from .landmarks import ImageLandmarks, spread_vertices
-from .rig import PointRig, PoseColumns
-from .solve import HeadPrior, HeadState, NormalEquations
-from .views import Occlusion, Views
+from .rig import PointRig, PoseColumns, PosedPoints
+from .views import FrameStack, Occlusion, Views
+
+
+class HeadState(NamedTuple):
+    """Estimate of a tracker."""
+
+    shape: FloatArray
+    """(S,) identity coefficients."""
+    poses: FloatArray
+    """(T, D) columns of `PoseColumns`."""
+
+
+class HeadPrior(NamedTuple):
+    """Expected magnitudes of the parameters; infinity disables the prior, 0 fixes the parameter."""
+
+    pose: FloatArray
+    """(D,) standard deviations around 0."""
+    shape: FloatArray
+    """(S,) the same."""
+
+
+class NormalEquations:
+    """Sums of ``J' A J`` and ``J' b`` over points, for T timesteps with D parameters each and S shared ones."""
+
+    def __init__(self, timesteps: int, pose_size: int, shape_size: int):
+        whole = pose_size + shape_size
+        self._split = pose_size
+        self._matrices = np.zeros((timesteps, whole, whole))
+        self._rights = np.zeros((timesteps, whole))
+
+    def add(self, timestep: int, posed: PosedPoints, curvature: FloatArray, slope: FloatArray) -> None:
+        """Add the points of a timestep.
+
+        ``posed``: P points and their derivatives. ``curvature``: (P, 3, 3) second derivatives of the cost by the points,
+        without those of the residuals. ``slope``: (P, 3) negative first derivatives of the cost by the points.
+        """
+        jacobian = np.concatenate([posed.by_pose, posed.by_shape], axis=2)
+        bent = np.einsum("pij,pjk->pik", curvature.astype(jacobian.dtype), jacobian)
+        width = jacobian.shape[2]
+        flat = jacobian.reshape(-1, width)
+        self._matrices[timestep] += flat.T @ bent.reshape(-1, width)
+        self._rights[timestep] += flat.T @ slope.astype(jacobian.dtype).reshape(-1)
+
+    def step(self, state: HeadState, prior: HeadPrior, damping: float = 1e-6) -> HeadState:
+        """The state after a step with the prior.
+
+        ``damping``: Fraction of the diagonal that is added to it (Levenberg-Marquardt).
+        """
+        split = self._split
+        deviations = np.concatenate([prior.pose, prior.shape])
+        free = deviations > 0
+        with np.errstate(divide="ignore"):
+            stiffness = np.where(free, 1 / deviations**2, 0.0)
+        count = len(self._matrices)
+        values = np.concatenate(
+            [state.poses, np.broadcast_to(state.shape, (count, len(state.shape)))], axis=1
+        )
+        # The shape has one prior, divided among the timesteps.
+        stiffness[split:] /= count
+        matrices = self._matrices * (free[:, None] & free)
+        rights = (self._rights - stiffness * values) * free
+        size = len(free)
+        diagonal = np.arange(size)
+        matrices[:, diagonal, diagonal] += (
+            stiffness + damping * matrices[:, diagonal, diagonal] + 1e-9 + ~free
+        )
+        own, shared, corner = (
+            matrices[:, :split, :split],
+            matrices[:, :split, split:],
+            matrices[:, split:, split:],
+        )
+        solved = np.linalg.solve(own, np.concatenate([rights[:, :split, None], shared], axis=2))
+        schur = corner.sum(axis=0) - np.einsum("tds,tdr->sr", shared, solved[:, :, 1:])
+        right = rights[:, split:].sum(axis=0) - np.einsum("tds,td->s", shared, solved[:, :, 0])
+        change = np.linalg.solve(schur, right) if len(right) else right
+        return HeadState(state.shape + change, state.poses + solved[:, :, 0] - solved[:, :, 1:] @ change)
+
 
 ANGLE_SPREAD = (np.inf,) * 3 + (0.15,) * 3 + (0.3, 0.03, 0.02) + (0.2, 0.3, 0.02) * 2
 """Standard deviations of the angles: rotation free, neck, jaw (which opens), eyes; radians."""
@@ -74,7 +148,7 @@ class Observations(NamedTuple):
 
 
 def sampled_vertices(head: HeadAsset) -> IntArray:
-    """Vertices whose colours are compared, spread over the regions `PARTS`. Raises `InputError` if the head has none of them."""
+    """Vertices whose colours are compared, spread over the regions `PARTS`."""
     inner = ("mouth_socket", "teeth", "boundary")
     taken = np.concatenate([np.asarray(head.regions.get(name, ()), np.int64) for name in inner])
     chosen = []
@@ -294,3 +368,62 @@ def _texture(
         scale = tolerance * np.maximum(own, max(float(np.median(square)), 1e-5))[samples.point]
         robust = weight / (1 + square / scale) ** 2
     return texture.astype(np.float32), (3 * robust / scale).astype(np.float32)
+
+
+TRIED = tuple(np.geomspace(0.8, 5.0, 9))
+"""Focal lengths relative to the longer side of the picture."""
+FRAMES = 16
+WEIGHT = 1.0
+"""Weight of a landmark relative to the prior. With that of tracking, residuals due to the prior would hide perspective."""
+CLEAR = 1.02
+"""Minimum ratio of the residuals at both ends of `TRIED` to the smallest one for a determined focal length."""
+
+
+class FocalLength(NamedTuple):
+    """An estimate."""
+
+    pixels: float
+    residuals: FloatArray
+    """(N,) root mean square distance of landmarks, pixels, at each tried focal length."""
+    tried: FloatArray
+    """(N,) pixels."""
+
+    @property
+    def clear(self) -> bool:
+        """Whether the landmarks determine the focal length."""
+        best = int(self.residuals.argmin())
+        return 0 < best < len(self.tried) - 1 and self.residuals[[0, -1]].min() > CLEAR * self.residuals[best]
+
+
+def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, side: float) -> FocalLength:
+    """The focal length at which the head model fits landmarks of one camera best.
+
+    Shape, poses and expressions are fitted for each tried length; between them the minimum of a parabola in its logarithm is
+    taken. Landmarks have systematic errors of some millimetres, and a near face with a short lens looks like a longer face, so that
+    the estimate may be wrong by a quarter.
+
+    ``landmarks``: (T, 1, L, 2) pixels of ``camera``. ``side``: Longer side of the camera's whole picture in pixels of
+    ``camera``, before it was cropped.
+    """
+    part = landmarks.of(landmarks.seen)
+    part = part.of(np.unique(np.linspace(0, len(part.pixels) - 1, FRAMES).astype(int)))
+    tried = side * np.array(TRIED)
+    residuals = np.array([_residual(head, camera, part, focal) for focal in tried])
+    best = int(residuals.argmin())
+    pixels = tried[best]
+    if 0 < best < len(tried) - 1:
+        below, least, above = residuals[best - 1 : best + 2]
+        step = 0.5 * (below - above) / (below - 2 * least + above)
+        pixels = tried[best] * (tried[best + 1] / tried[best]) ** step
+    return FocalLength(float(pixels), residuals, tried)
+
+
+def _residual(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, focal: float) -> float:
+    K = np.array(camera.K, np.float64)
+    K[0, 0] = K[1, 1] = focal
+    views = Views([Camera(camera.id, camera.width, camera.height, K, camera.world_to_camera)])
+    fitter = Fitter(head, views, landmarks, WEIGHT)
+    state = fitter.fit_landmarks(fitter.start())
+    equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
+    distances = fitter.add_landmarks(equations, fitter.landmark_rig(), state)
+    return float(np.sqrt(np.mean(distances**2)))

@@ -6,15 +6,23 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from ...bench.configuration import build
 from ...bench.contracts import Progress
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
-from ...bench.io.files import digest, digest_file, write_json
+from ...bench.io.files import check_output_folder, digest, digest_file, write_json
 from ...bench.process import described, environment, run_program
+from ...bench.specs import CommandResult, Need
+from ..head.refit.command import target_head
+from ..head.refit.rewrite import link_or_copy
+from ..monocular.clip import check_subject, subject_of
+from ..tracker_files.command import ImportTrackingSettings, import_tracking
+from ..video.decode import is_video, probe_video
 
 IMPORT_TIMEOUT_S = 300.0
 """Time limit for an interpreter to import the modules of a program, seconds."""
@@ -23,18 +31,12 @@ STEPS, LOG = "steps.json", "program.log"
 
 @dataclass(frozen=True)
 class WorkingFolder:
-    """Working folder of a program.
-
-    Attributes
-    ----------
-    folder : Path
-        For everything that the program writes; absolute.
-    video : Path
-        The file of the video in it, named by the subject.
-    """
+    """Working folder of a program."""
 
     folder: Path
+    """For everything that the program writes; absolute."""
     video: Path
+    """The file of the video in it, named by the subject."""
 
     @property
     def name(self) -> str:
@@ -44,51 +46,34 @@ class WorkingFolder:
 
 @dataclass(frozen=True)
 class Step:
-    """One of a program's commands.
-
-    Attributes
-    ----------
-    name : str
-        For messages.
-    arguments : Callable
-        Arguments of the interpreter, in the checkout's folder: a script and its arguments.
-    output : str
-        Pattern of files in the working folder of which one exists afterwards; programs may fail with exit code 0. It contains
-        ``{name}`` for the name of the video.
-    """
+    """One of a program's commands."""
 
     name: str
+    """For messages."""
     arguments: Callable[[WorkingFolder], list[str]]
+    """Arguments of the interpreter, in the checkout's folder: a script and its arguments."""
     output: str
+    """Pattern of files in the working folder of which one exists afterwards; programs may fail with exit code 0. It
+    contains ``{name}`` for the name of the video."""
 
 
 @dataclass(frozen=True)
 class TrackingProgram:
-    """A tracker.
-
-    Attributes
-    ----------
-    url, commit : str
-        Its repository, and the commit that the commands are of.
-    steps : tuple[Step, ...]
-        In order.
-    variables : Callable
-        Environment variables in addition to those of `run_program`, of checkout and work.
-    modules : tuple[str, ...]
-        Modules that its interpreter must be able to import.
-    files : tuple[str, ...]
-        Files of the checkout that it distributes separately, such as weights, with the remedy if one is missing.
-    remedy : str
-        How to get them.
-    """
+    """A tracker."""
 
     url: str
     commit: str
+    """Its repository, and the commit that the commands are of."""
     steps: tuple[Step, ...]
+    """In order."""
     variables: Callable[[Path, WorkingFolder], Mapping[str, str]]
+    """Environment variables in addition to those of `run_program`, of checkout and work."""
     modules: tuple[str, ...]
+    """Modules that its interpreter must be able to import."""
     files: tuple[str, ...]
+    """Files of the checkout that it distributes separately, such as weights, with the remedy if one is missing."""
     remedy: str
+    """How to get them."""
 
 
 def _no_variables(checkout: Path, work: WorkingFolder) -> Mapping[str, str]:
@@ -182,10 +167,7 @@ def export_folder(work: WorkingFolder) -> Path:
 
 
 def check_program(name: str, checkout: Path, python: str) -> tuple[TrackingProgram, Path]:
-    """The program of a name, whose checkout and interpreter are complete, and the interpreter's path.
-
-    Raises `InputError` as `check_checkout` and `check_interpreter`.
-    """
+    """The program of a name, whose checkout and interpreter are complete, and the interpreter's path."""
     check_checkout(name, checkout)
     return PROGRAMS[name], check_interpreter(name, python)
 
@@ -278,3 +260,102 @@ def run_steps(
             raise result.error(f"{name}: {step.name} wrote no {pattern} in {work.folder}")
         finished[step.name] = state
         write_json(record, finished)
+
+
+@dataclass(frozen=True)
+class ProgramPlace:
+    """Where a tracker is installed."""
+
+    checkout: str = ""
+    """Folder of its repository."""
+
+    python: str = "python3"
+    """Interpreter of its environment."""
+
+
+def vhap(settings: Mapping[str, Any], device: str) -> Iterator[Need]:
+    """Checkout of VHAP with FLAME, and its environment."""
+    return _needs("vhap", settings)
+
+
+def pixel3dmm(settings: Mapping[str, Any], device: str) -> Iterator[Need]:
+    """Checkout of Pixel3DMM with its weights, and its environment."""
+    return _needs("pixel3dmm", settings)
+
+
+def _needs(name: str, settings: Mapping[str, Any]) -> Iterator[Need]:
+    """Needs of a program."""
+    place = build(ProgramPlace, settings, "command line", f"--set settings.{name}.")
+    if not place.checkout:
+        remedy = (
+            f"git clone --recursive {PROGRAMS[name].url}, install it as its page says, and give "
+            f"--set settings.{name}.checkout=DIR --set settings.{name}.python=FILE."
+        )
+        yield Need("checkout and environment", "", remedy)
+        return
+    checkout = Path(place.checkout).absolute()
+    try:
+        check_checkout(name, checkout)
+    except InputError as error:
+        yield Need("checkout", "", str(error))
+    else:
+        yield Need("checkout", str(checkout))
+    try:
+        yield Need(
+            "environment", str(check_interpreter(name, place.python, f"--set settings.{name}.python=FILE"))
+        )
+    except InputError as error:
+        yield Need("environment", "", str(error))
+
+
+CAPTURE = "capture"
+"""Folder of the capture, beside that of the program."""
+
+if TYPE_CHECKING:
+    from .settings import TrackSettings
+
+
+def track_with_program(settings: TrackSettings, progress: Progress) -> CommandResult:
+    """Run another tracker on the file of a video and convert its output to a capture.
+
+    Its files are in a folder of its name in ``settings.out``, the capture beside it. A repeated call resumes after the last
+    finished step.
+    """
+    source, name = Path(settings.capture), settings.program
+    if not is_video(source):
+        raise InputError(source, "", f"the file of a video, for --with {name}", "something else")
+    probe_video(source)
+    if not settings.head:
+        raise InputError("command line", "--head", "the FLAME model that the tracker uses", "none")
+    target_head(settings.head, "--head")
+    subject = settings.subject or subject_of(source)
+    check_subject(subject, "--subject")
+    if "." in subject:
+        raise InputError(
+            "command line", "--subject", "a name without dots, which the programs cut off", subject
+        )
+    check_output_folder(Path(settings.out))
+    checkout = Path(settings.checkout).absolute()
+    program, interpreter = check_program(name, checkout, settings.python)
+    folder = Path(settings.out).absolute() / name
+    folder.mkdir(parents=True, exist_ok=True)
+    work = WorkingFolder(folder, folder / f"{subject}.mp4")
+    link_or_copy(source.resolve(), work.video)
+    run_steps(name, program, checkout, interpreter, work, progress)
+    message = f"{name} has finished; its output is in {folder / LOG}."
+    if name == "vhap":
+        capture = export_folder(work)
+        text = f"{message}\nThen: headbench lint {capture} --head {settings.head}\nCapture: {capture}"
+        return CommandResult(text, {"capture": capture.as_posix()})
+    (tracked,) = sorted(folder.glob(f"tracking/{subject}_nV1*"))[:1]
+    given = ImportTrackingSettings(
+        source=str(tracked),
+        head=settings.head or "",
+        out=str(folder.parent / CAPTURE),
+        format=name,
+        images=str(folder / "preprocessed" / subject / "cropped"),
+        subject=subject,
+        held_out_frames=settings.held_out_frames,
+    )
+    found = import_tracking(given, progress)
+    return CommandResult(f"{message}\n{found.text}", found.data)

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
-from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
+from ...bench.contracts import BoolArray, FloatArray, HeadAsset, HeadPose, IntArray
 from ..head.arrays import JOINT_NAMES
-from ..head.rotations import matrices_and_derivatives
+from ..head.rotations import matrices_and_derivatives, rotation_of
 
 JOINTS = len(JOINT_NAMES)
 ANGLES = 3 * JOINTS
@@ -102,16 +103,8 @@ class _Posed(NamedTuple):
 class PointRig:
     """P points on a head model.
 
-    Parameters
-    ----------
-    head : HeadAsset
-        Head model in FLAME's layout.
-    corners : IntArray
-        (P, 3) vertices of each point.
-    weights : FloatArray
-        (P, 3) their shares, rows sum to 1.
-    dtype : type
-        Type of the points and of the derivatives.
+    ``head``: Head model in FLAME's layout. ``corners``: (P, 3) vertices of each point. ``weights``: (P, 3) their shares,
+    rows sum to 1. ``dtype``: Type of the points and of the derivatives.
     """
 
     def __init__(self, head: HeadAsset, corners: IntArray, weights: FloatArray, dtype: Any = np.float32):
@@ -217,3 +210,32 @@ class PointRig:
             shifts[joint] = shift + (above - turns[joint]) @ rest[joint]
             shifts_by[:, joint] += bend_by @ rest[joint]
         return _Joints(turns, shifts, turns_by, shifts_by, by_coefficient), rotations, derivatives
+
+
+WINDOW = 9
+"""Timesteps with whose median one in their middle is compared."""
+TURN, MOVE = 0.25, 0.08
+"""Minimum rotation of the head, radians, and translation, metres, from the median that count as a jump."""
+USUAL = 6.0
+"""Minimum ratio of a jump to the median difference, for captures with few timesteps or fast motion."""
+WORSE = 2.5
+"""Minimum ratio of a residual to its median that counts as a fit that failed."""
+
+
+def outliers(poses: FloatArray, residuals: FloatArray, columns: PoseColumns) -> BoolArray:
+    """(T,) timesteps without a fit to landmarks, with a jump of the head, or with a much larger residual than their neighbours.
+
+    ``poses``: (T, D) columns of ``columns``. ``residuals``: (T, 2) `TimestepResidual` without the timestep; 0 pixels where
+    no landmark was used.
+    """
+    turns = (rotation_of(poses[:, :3]) * rotation_of(poses[:, 3:6])).as_matrix().reshape(-1, 9)
+    wrong = (residuals[:, 0] <= 0) | (residuals > WORSE * _median(residuals)).any(axis=1)
+    # The Frobenius norm of the difference of two rotations is about their angle times the root of 2.
+    for values, least in ((turns / np.sqrt(2), TURN), (poses[:, columns.translation], MOVE)):
+        apart = np.linalg.norm(values - _median(values), axis=1)
+        wrong |= apart > max(least, USUAL * float(np.median(apart)))
+    return np.asarray(wrong)
+
+
+def _median(values: FloatArray) -> FloatArray:
+    return np.asarray(ndimage.median_filter(values, (WINDOW, 1), mode="nearest"))

@@ -1,15 +1,103 @@
-"""Settings of the head tracker."""
+"""Settings of ``headbench track``, and its folder of intermediate results. Light to import."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from ...bench.errors import InputError
+from ...bench.io.files import TEMPORARY, check_output_folder, write_text
 from ...bench.options import DependentOptions
-from ..options import CaptureOptions
-from ..video.settings import VideoOptions
+from ..options import CaptureOptions, Cut
+
+WORK = ".track"
+"""Its name in the folder of ``--out``."""
+TRACKER_VERSION = "2"
+"""Part of the key of intermediate results; raise it when code of the tracker or the reader of videos changes them."""
+_NOTE = "README.txt"
+_TEXT = """headbench track continues from these files after an interruption and deletes them at the end.
+Those of a video show the person. This folder can be deleted: the next call begins again then.
+"""
+
+
+def check_work_folder(folder: Path) -> None:
+    """Raise `InputError` if the path has something not created by `make_work_folder`, since it will be deleted."""
+    if folder.is_symlink():
+        found = "a link"
+    elif folder.is_dir():
+        unfinished = all(path.name.startswith(TEMPORARY) for path in folder.iterdir())  # by a kill at once
+        found = "" if (folder / _NOTE).is_file() or unfinished else "files of something else"
+    else:
+        found = "a file" if folder.exists() else ""
+    if found:
+        expected = "a folder that headbench track made, or none"
+        raise InputError(folder, "", expected, found, "Move it away, or choose another --out.")
+
+
+def make_work_folder(folder: Path) -> None:
+    """Make the folder, with a note that says what it is."""
+    check_work_folder(folder)
+    check_output_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / _NOTE).is_file():
+        write_text(folder / _NOTE, _TEXT)
+
+
+MASKLESS, BACKGROUND = "none", "background"
+"""Values of --masks that are no folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoOptions:
+    """Options of `headbench track` for a video file; without effect on captures."""
+
+    segmentation: str = ""
+    """Video: MediaPipe's selfie_segmentation.tflite, which finds the person in each frame; default without --masks: that of
+    --fetch-networks."""
+
+    masks: str = ""
+    """Video: folder of masks instead, of the video's size, named by the number of the frame in the file (00000.png or 0000.jpg is
+    the first frame, also where --rate takes fewer); "background" for the difference from the empty room, which a static camera must show
+    for some seconds without a person; or "none" to keep the room behind the person, which then counts in every metric."""
+
+    cut: Cut = "bust-line"
+    """Video: part of the person that is replaced by background, since no head model explains it: all below a line through the
+    front of the neck's lower end, as VHAP's export does, or nothing."""
+
+    parsing: str = ""
+    """Video: folder of label images (19 classes of CelebAMask-HQ) named as --masks: clothes are cut by them instead."""
+
+    focal: float | None = None
+    """Video: focal length in pixels of its upright frames; default: estimated from the landmarks, which is inexact."""
+
+    rate: float = 25.0
+    """Video: maximum frame rate; frames of a faster video are skipped."""
+
+    longest: int | None = None
+    """Video: maximum number of frames that are used, from its beginning; default: all."""
+
+    size: int = 512
+    """Video: longest side of the frames after a crop around the head, pixels; smaller frames are not enlarged."""
+
+    subject: str = ""
+    """Video: name of the subject; default: that of the file."""
+
+    held_out_frames: int | None = None
+    """Video: number of last frames held out for self-reenactment; default: 350, or a quarter of fewer than 700."""
+
+    def check_video(self) -> None:
+        """Raise `ValueError` for a value out of range."""
+        if self.focal is not None and not self.focal > 0:
+            raise ValueError(f"focal is {self.focal}; more than 0")
+        if not 1 <= self.rate <= 240:
+            raise ValueError(f"rate is {self.rate}; from 1 to 240")
+        if not 64 <= self.size <= 4096:
+            raise ValueError(f"size is {self.size}; from 64 to 4096")
+        if self.longest is not None and self.longest < 1:
+            raise ValueError(f"longest is {self.longest}; at least 1")
 
 
 @dataclass(frozen=True)

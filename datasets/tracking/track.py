@@ -12,19 +12,99 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ...bench.contracts import FloatArray, Progress, no_progress
+from ...bench.contracts import Clip, FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.engine.config import RunConfig
 from ...bench.errors import InputError
-from ...bench.io.arrays import Member, cached_arrays
-from ...bench.io.files import digest
-from ..clip import CaptureClip
-from .fit import Fitter
-from .images import FrameStack
-from .landmarks import ImageLandmarks
-from .outliers import outliers
-from .rig import PoseColumns
-from .solve import HeadState
-from .views import Views
-from .work import TRACKER_VERSION
+from ...bench.io.arrays import MAX_MAGNITUDE, Member, cached_arrays, read_arrays
+from ...bench.io.files import digest, digest_file
+from ...bench.progress import progress
+from ..clip import CaptureClip, as_capture
+from ..ga.writer import save_npz
+from ..head.geometry import fit_sphere
+from ..head.model import PosedSubject
+from ..open import open_clip
+from .fit import Fitter, HeadState
+from .landmarks import ImageLandmarks, landmark_source
+from .rig import PoseColumns, outliers
+from .settings import TRACKER_VERSION
+from .views import FrameStack, Views
+
+LID_REACH = 1.25
+"""Lids are the skin within this many radii of an eyeball's centre."""
+
+
+class RegionError(NamedTuple):
+    """Root mean square errors of a region over its vertices and all timesteps, millimetres."""
+
+    absolute: float
+    """Distance of the vertices."""
+    affine: float
+    """Distance after the best affine map of the region at each timestep."""
+    motion: float
+    """Change of the distance over time, in the frame of the head: the error after subtracting each vertex's mean error."""
+
+
+def error_regions(head: HeadAsset) -> dict[str, IntArray]:
+    """Vertices of face (without lips, lids and eyeballs), lips, lids, eyeballs, neck and scalp, as far as the head has them."""
+    known = {name: np.asarray(members, np.int64) for name, members in head.regions.items() if len(members)}
+    template = np.asarray(head.template, np.float64)
+    none = np.zeros(0, np.int64)
+    eyeballs, lids = none, none
+    for side in ("left_eyeball", "right_eyeball"):
+        if side in known:
+            eyeballs = np.union1d(eyeballs, known[side])
+            middle, radius = fit_sphere(template[known[side]])
+            lids = np.union1d(
+                lids, np.flatnonzero(np.linalg.norm(template - middle, axis=1) < LID_REACH * radius)
+            )
+    lids = np.setdiff1d(np.intersect1d(lids, known.get("eye_region", none)), eyeballs)
+    lips = known.get("lips", none)
+    inner = np.concatenate([eyeballs, lids, lips, known.get("mouth_socket", none), known.get("teeth", none)])
+    regions = {
+        "face": np.setdiff1d(known.get("face", none), inner),
+        "lips": lips,
+        "lids": lids,
+        "eyeballs": eyeballs,
+    }
+    regions |= {name: known.get(name, none) for name in ("neck", "scalp")}
+    return {name: members for name, members in regions.items() if len(members)}
+
+
+def tracking_errors(tracked: Clip, exact: Clip) -> Mapping[str, RegionError]:
+    """Errors of a clip's tracking against that of another clip of the same subject, by region."""
+    where = f"clip of {tracked.subject}"
+    if tracked.head.faces.shape != exact.head.faces.shape or not np.array_equal(
+        tracked.head.faces, exact.head.faces
+    ):
+        raise InputError(where, "head", f"the topology of {exact.head.version}", tracked.head.version)
+    timesteps = sorted({*tracked.poses} & {*exact.poses})
+    if not timesteps:
+        raise InputError(where, "poses", "timesteps of the other capture", "none of them")
+    subjects = PosedSubject.of(tracked), PosedSubject.of(exact)
+    assert isinstance(exact.head, HeadAsset)
+    poses = [[clip.poses[timestep] for timestep in timesteps] for clip in (tracked, exact)]
+    found, wanted = (subject.meshes(own) for subject, own in zip(subjects, poses))
+    turns = subjects[1].motions(poses[1])[:, :3, :3]
+    return {
+        name: mesh_errors(found[:, members], wanted[:, members], turns)
+        for name, members in error_regions(exact.head).items()
+    }
+
+
+def mesh_errors(found: FloatArray, wanted: FloatArray, turns: FloatArray) -> RegionError:
+    """Errors of points (T, n, 3) relative to others, metres, for a head with rotations (T, 3, 3)."""
+
+    def spread(gaps: FloatArray) -> float:
+        return 1e3 * float(np.sqrt((gaps**2).sum(axis=-1).mean()))
+
+    gaps = found - wanted
+    own = np.einsum("tij,tni->tnj", turns, gaps)
+    mapped = []
+    for one, other in zip(found, wanted):
+        terms = np.concatenate([one - one.mean(axis=0), np.ones((len(one), 1))], axis=1)
+        mapped.append(terms @ np.linalg.lstsq(terms, other, rcond=None)[0] - other)
+    return RegionError(spread(gaps), spread(np.stack(mapped)), spread(own - own.mean(axis=0)))
+
 
 LEAST_TRACKED = 0.5
 """Minimum fraction of timesteps that must be tracked."""
@@ -114,16 +194,9 @@ def track(
     Neither shape, poses nor static offset of the clip are used, other than by ``source``. The shape is estimated with the
     first timesteps, spread over the clip, and kept for the others.
 
-    Parameters
-    ----------
-    cameras : Sequence[str]
-        Cameras whose images are used; one is enough.
-    source : LandmarkSource
-        Finds landmarks.
-    notes : Mapping[str, Any] | None
-        Recorded with the step.
-    store : Path | None
-        Folder that keeps the fit of every part, which a later call with the same images and landmarks does not repeat.
+    ``cameras``: Cameras whose images are used; one is enough. ``source``: Finds landmarks. ``notes``: Recorded with the
+    step. ``store``: Folder that keeps the fit of every part, which a later call with the same images and landmarks does not
+    repeat.
     """
     where = f"clip of {clip.subject}"
     check_cameras(clip, cameras)
@@ -192,7 +265,7 @@ def track(
 
 
 def without_timesteps(clip: CaptureClip, left_out: Collection[int]) -> CaptureClip:
-    """A clip without the frames of some timesteps. Raises `InputError` if no training frame remains."""
+    """A clip without the frames of some timesteps."""
     splits = {
         name: tuple(key for key in keys if key.timestep not in left_out) for name, keys in clip.splits.items()
     }
@@ -287,3 +360,55 @@ def _fit_block(
         "colours": fitted.colours,
         "seconds": np.array(time.perf_counter() - begin),
     }
+
+
+FOLDER = "tracked"
+"""Folder of a run with the parameters that were estimated."""
+
+
+def with_tracking(
+    clip: Clip, config: RunConfig, *, landmarks: str = "", embedding: str = "", seed: int = 0
+) -> CaptureClip:
+    """The clip with the tracking of ``headbench track``, without the frames that it leaves out; estimated once and kept in
+    ``config.out``.
+
+    Parameters
+    ----------
+    landmarks, embedding : str
+        File of the landmark network and capture to learn its embedding on; without them the landmarks are those of a known
+        rig.
+    seed : int
+        Seed of the error of these.
+    """
+    capture = as_capture(clip)
+    columns = PoseColumns.of(capture.head)
+    teacher = as_capture(open_clip(embedding)) if embedding else None
+    settings = {
+        "landmarks": digest_file(Path(landmarks))[:16] if landmarks else "",
+        "embedding": teacher.fingerprint if teacher else "",
+        "seed": seed,
+    }
+    name = digest(TRACKER_VERSION, capture.fingerprint, settings)[:16]
+    place = Path(config.out) / FOLDER / f"{capture.subject}-{name}.npz"
+    if not place.exists():
+        with progress(f"tracking {capture.subject}") as report:
+            cameras = [*capture.cameras]
+            source = landmark_source(capture, cameras, landmarks, teacher, seed)
+            found = track(capture, cameras, source, progress=report).clip
+        timesteps = sorted(found.poses)
+        rows = columns.rows([found.poses[timestep] for timestep in timesteps])
+        save_npz(place, {"shape": np.asarray(found.shape), "poses": rows, "timesteps": np.array(timesteps)})
+    members = {"shape": Member("f", ("S",), MAX_MAGNITUDE), "poses": Member("f", ("T", "D"), MAX_MAGNITUDE)}
+    members["timesteps"] = Member("i", ("T",))
+    sizes = {"S": capture.head.shape_basis.shape[2], "D": columns.size}
+    stored = read_arrays(place, members, sizes)
+    timesteps = stored["timesteps"].tolist()
+    poses = columns.poses(stored["poses"], capture.head, capture.subject, timesteps)
+    left_out = {key.timestep for key in capture.files}.difference(timesteps)
+    return without_timesteps(capture, left_out).derive(
+        "track",
+        {**settings, "parameters": digest(stored["shape"], stored["poses"])},
+        shape=stored["shape"],
+        static_offset=np.zeros(capture.head.template.shape, np.float32),
+        poses=dict(zip(timesteps, poses)),
+    )

@@ -17,13 +17,11 @@ from ...bench.landmark_network import COUNT, fetched_network
 from ...bench.progress import counted
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
-from ..tracking.embedding import Embedding
-from ..tracking.focal import FocalLength, estimate_focal
-from ..tracking.network import NetworkLandmarks, head_embedding
-from ..tracking.work import TRACKER_VERSION, make_work_folder
+from ..tracking.fit import FocalLength, estimate_focal
+from ..tracking.landmarks import Embedding, NetworkLandmarks, head_embedding
+from ..tracking.settings import TRACKER_VERSION, make_work_folder
 from .clip import USUAL_FOCAL, FrameView, VideoClip, open_video
-from .detector import FaceFinder
-from .faces import LEAST_SEEN, REMEDY
+from .faces import LEAST_SEEN, REMEDY, FaceFinder
 
 if TYPE_CHECKING:
     from ..tracking.settings import TrackSettings
@@ -50,7 +48,7 @@ class OpenedVideo(NamedTuple):
 def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) -> OpenedVideo:
     """The clip of a video with its focal length.
 
-    Its frames and results are stored in ``folder``, from which a later call resumes. Raises `InputError` as `open_video`.
+    Its frames and results are stored in ``folder``, from which a later call resumes.
     """
     path = Path(settings.capture)
     named = settings.head or EMBEDDED

@@ -82,10 +82,7 @@ def video_frames(path: Path, rate: float | None = None) -> Iterator[TimedFrame]:
     Of a video whose rate varies, or that has more than ``rate`` frames a second, the first frame from each multiple of
     1 / ``rate`` on is taken.
 
-    Parameters
-    ----------
-    rate : float | None
-        Maximum number of frames a second; None for all frames.
+    ``rate``: Maximum number of frames a second; None for all frames.
     """
     following = 0
     size = None

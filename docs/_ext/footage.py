@@ -16,10 +16,10 @@ from PIL import Image
 from headbench.bench.contracts import ByteArray, Camera
 from headbench.datasets.clip import CaptureClip
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.mesh_pictures import draw_mesh
 from headbench.datasets.synthetic.plan import FRONTAL
-from headbench.datasets.video.background import LEAST_EMPTY, learn_background
+from headbench.datasets.video.clip import LEAST_EMPTY, learn_background
 
 PICTURES = Path(__file__).parents[1] / "pictures"
 LONGEST = 440

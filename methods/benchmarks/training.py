@@ -33,7 +33,7 @@ from ...bench.contracts import (
 from ...bench.doctor import Row, findings, take_turns
 from ...bench.specs import CommandResult, MethodSpec
 from ...datasets.head.procedural.model import procedural_head
-from ...datasets.steps.jaw_bases import jaw_quaternions
+from ...datasets.steps.clusters import jaw_quaternions
 from ..ga.method import GAAppearance, GAAvatar
 from ..ga.spec import GA, GAConfig
 from ..gbs.method import GBSTraining

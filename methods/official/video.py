@@ -29,8 +29,8 @@ from ...bench.errors import InputError
 from ...bench.io.files import atomic_path
 from ...bench.io.images import read_pixels
 from ...datasets.head.loaders import FLAME_IDENTITY_SIZE
+from ...datasets.head.model import BATCH, PosedSubject, camera_in_head_frame, pose_in_head_frame
 from ...datasets.head.rotations import rotation_of
-from ...datasets.head.subject import BATCH, PosedSubject, camera_in_head_frame, pose_in_head_frame
 from ...datasets.images import write_image
 from ...datasets.steps.masks import recomposite
 from ..insta.marching import CanonicalSurface, PosedSurface

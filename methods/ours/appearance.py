@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...bench.contracts import Clip, FloatArray, HeadPose
 from ...datasets.head.arrays import faces_in_region
-from ...datasets.steps.jaw_bases import jaw_bases, jaw_quaternions, jaw_weights
+from ...datasets.steps.clusters import jaw_bases, jaw_quaternions, jaw_weights
 from ..ops.planes import Bounds, harmonic_colors, initial_coefficients, line_offsets, plane_colors, smoothing
 from ..ops.splats import NORMAL, TriangleFrames, directions_to, to_world
 from ..shared.optimisation import Optimiser

@@ -20,8 +20,13 @@ from torch import Tensor
 from ...bench.contracts import Changes, Clip, FloatArray, HeadPose
 from ...bench.native.dispatch import to_device
 from ...datasets.head.arrays import JOINT_NAMES, faces_in_region
-from ...datasets.steps.clusters import cluster_expressions
-from ...datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions, leaks
+from ...datasets.steps.clusters import (
+    IDENTITY,
+    cluster_expressions,
+    farthest_quaternions,
+    jaw_quaternions,
+    leaks,
+)
 from ..avatars.compact.layouts import field as field_layout
 from ..avatars.compact.layouts import read_coded
 from ..ops.planes import (

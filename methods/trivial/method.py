@@ -28,7 +28,7 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.images import read_pixels
 from ...bench.protocol import evenly_with_ends
-from ...datasets.head.subject import PosedSubject
+from ...datasets.head.model import PosedSubject
 from ...datasets.images import write_image
 from ...datasets.mesh_pictures import rasterize_mesh
 from ..shared.avatar_files import (

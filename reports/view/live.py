@@ -20,7 +20,7 @@ from .settings import STANDARD_INPUT, ViewSettings
 
 log = logging.getLogger(__name__)
 
-DRIVER = "headbench.datasets.drive.live:LiveDriver"
+DRIVER = "headbench.datasets.drive.transfer:LiveDriver"
 """Converts lines to poses of a head model; referred to by name, since this package imports no reader."""
 LOOPBACK = "127.0.0.1"
 LONGEST_LINE = 2**20

@@ -8,8 +8,8 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.errors import InputError
-from headbench.datasets.foreign import describe
 from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.open import describe
 
 RIGID = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 FRAME = {"file_path": "images/1.png", "transform_matrix": RIGID}

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from headbench.bench.errors import InputError
 from headbench.datasets import images
+from headbench.datasets.head.geometry import on_grid
 from headbench.datasets.images import ImageStore, read_image, write_image
-from headbench.datasets.rounding import on_grid
 
 
 @pytest.mark.parametrize(

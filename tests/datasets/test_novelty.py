@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from skimage.transform import downscale_local_mean
 
-from headbench.datasets.novelty import novelty
-from headbench.datasets.steps.resolution import resize_image
+from headbench.datasets.inspect.statistics import novelty
+from headbench.datasets.steps.for_method import resize_image
 
 RNG = np.random.default_rng(7)
 

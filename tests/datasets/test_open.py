@@ -13,8 +13,8 @@ from headbench.bench.specs import ResolutionRule
 from headbench.datasets.clip import as_capture
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.open import find_reader, open_clip
+from headbench.datasets.steps.for_method import align_clip
 from headbench.datasets.steps.masks import set_background
-from headbench.datasets.steps.resolution import align_clip
 
 
 def test_a_capture_is_opened_by_the_reader_that_finds_it(pristine_capture):

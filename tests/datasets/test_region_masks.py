@@ -7,9 +7,9 @@ import numpy as np
 
 from headbench.bench.contracts import HeadPose, RegionalClip
 from headbench.bench.engine.scoring import check_regions
+from headbench.datasets.clip import HeadRegions, select
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import HeadArrays
-from headbench.datasets.region_masks import HeadRegions, select
 
 from .head.toy import toy_head
 from .tiny_capture import look_at, posed_vertices, silhouette

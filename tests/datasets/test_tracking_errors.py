@@ -7,7 +7,7 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.tracking_errors import error_regions, mesh_errors, tracking_errors
+from headbench.datasets.tracking.track import error_regions, mesh_errors, tracking_errors
 
 from .head.toy import toy_head
 

@@ -13,7 +13,7 @@ from headbench.bench.contracts import Camera, HeadPose
 from headbench.bench.experiments import viewpoints
 from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from headbench.datasets.head.arrays import HeadArrays
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
 
 from .head.toy import toy_head

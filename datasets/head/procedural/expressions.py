@@ -16,9 +16,8 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
 from ....bench.contracts import FloatArray
-from ...rounding import COEFFICIENT_BITS, LENGTH_BITS, on_grid
-from ..geometry import mesh_edges, smoothstep, unique_pairs
-from .anatomy import EYE_CENTER, EYE_RADIUS, MOUTH_HALF_WIDTH, eye_front, lid_curves, lip_arc
+from ..geometry import COEFFICIENT_BITS, LENGTH_BITS, mesh_edges, on_grid, smoothstep, unique_pairs
+from .sculpture import EYE_CENTER, EYE_RADIUS, MOUTH_HALF_WIDTH, eye_front, lid_curves, lip_arc
 from .surface import MIRROR, SculptedHead, jaw_weight
 
 _MIXING_BITS = 25  # 2**-25 times 2**-27 m: exact up to two metres in float64
@@ -194,10 +193,7 @@ class ExpressionBasis:
 def principal_basis(shapes: dict[str, FloatArray], deviation: FloatArray, seed: int) -> ExpressionBasis:
     """Principal components of ``shapes`` under correlated normal activations.
 
-    Parameters
-    ----------
-    shapes : dict[str, FloatArray]
-        K displacements (V, 3).
+    ``shapes``: K displacements (V, 3).
 
     Notes
     -----
@@ -278,10 +274,7 @@ def lid_turn(surface: SculptedHead, upper: FloatArray | float, lower: FloatArray
     The margins and the inner sides of the lids rotate rigidly about the eyeball; the surrounding skin follows by the
     harmonic field between the margins and fixed vertices.
 
-    Parameters
-    ----------
-    upper, lower : FloatArray | float
-        Rotation of each margin, radians, positive up; a number, or one for each vertex.
+    ``upper``, ``lower``: Rotation of each margin, radians, positive up; a number, or one for each vertex.
     """
     relative = surface.vertices - EYE_CENTER
     x, y, z = relative.T

@@ -6,8 +6,8 @@ import functools
 
 import numpy as np
 
-from ...rounding import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from ..arrays import HeadArrays
+from ..geometry import LENGTH_BITS, REGRESSOR_BITS, SHARE_BITS, on_grid
 from .expressions import LIDS, identity_basis
 from .surface import (
     PARENTS,
@@ -25,11 +25,8 @@ from .versions import SEEDS, basis_of_version, full_version, version_shapes
 def procedural_head(version: str = "2023") -> HeadArrays:
     """The embedded default head, made once in a process.
 
-    Parameters
-    ----------
-    version : str
-        "2023" ("procedural2023") or "2020" ("procedural2020"). Both have the same topology and
-        template. In 2020 two eyelid bases represent the blinks, and shapes and directions differ slightly.
+    ``version``: "2023" ("procedural2023") or "2020" ("procedural2020"). Both have the same topology and template. In 2020
+    two eyelid bases represent the blinks, and shapes and directions differ slightly.
     """
     name = full_version(version)
     surface = load_sculpture()

@@ -16,8 +16,9 @@ from skimage.measure import marching_cubes
 from ....bench.contracts import FloatArray, IntArray
 from ....bench.io.files import atomic_path
 from ..geometry import border_edges, mesh_edges, triangle_areas, unique_pairs
-from .anatomy import (
+from .sculpture import (
     CLOSED_LIP_GAP,
+    EAR_ORIGIN,
     EYE_CENTER,
     FLOOR,
     LATERAL_CANTHUS,
@@ -30,9 +31,9 @@ from .anatomy import (
     eye_front,
     lid_curves,
     lip_arc,
+    sculpture,
     slit_height,
 )
-from .sculpture import EAR_ORIGIN, sculpture
 
 SHORTEST_EDGE = 0.00035  # metres; lids and lips are sculpted several times further apart
 ITERATIONS = 40  # of centring the clusters that become coarse vertices
@@ -41,21 +42,14 @@ LOW, HIGH = (0.0, FLOOR, -0.13), (0.115, 0.15, 0.11)
 
 @dataclass(frozen=True)
 class SculptSettings:
-    """Settings of the sculptor.
-
-    Attributes
-    ----------
-    out : Path
-        Output npz: ``vertices`` (V, 3) float32 metres, ``faces`` (F, 3) int32, ``mirror`` (V,) int32.
-    step : float
-        Voxel size of the fine surface, metres.
-    detail : float
-        Factor on the wanted edge lengths; smaller is finer.
-    """
+    """Settings of the sculptor."""
 
     out: Path
+    """Output npz: ``vertices`` (V, 3) float32 metres, ``faces`` (F, 3) int32, ``mirror`` (V,) int32."""
     step: float = 0.0007
+    """Voxel size of the fine surface, metres."""
     detail: float = 1.13
+    """Factor on the wanted edge lengths; smaller is finer."""
 
 
 def edge_length(points: FloatArray) -> FloatArray:
@@ -248,17 +242,10 @@ def coarsen(
 ) -> tuple[FloatArray, IntArray]:
     """Coarse mesh of a fine one.
 
-    Parameters
-    ----------
-    vertices, faces : FloatArray, IntArray
-        The fine mesh, manifold, with at least about three edges per target edge.
-    size : FloatArray
-        (V,) target edge length, metres.
-    fixed : IntArray
-        Fine vertices that become coarse vertices unchanged.
-    border : IntArray
-        (V,) bit set of the border lines through each fine vertex (0 inside). A coarse vertex whose
-        cluster touches border lines stays on them, so borders keep their shape.
+    ``vertices``, ``faces``: The fine mesh, manifold, with at least about three edges per target edge. ``size``: (V,) target
+    edge length, metres. ``fixed``: Fine vertices that become coarse vertices unchanged. ``border``: (V,) bit set of the
+    border lines through each fine vertex (0 inside). A coarse vertex whose cluster touches border lines stays on them, so
+    borders keep their shape.
 
     Returns
     -------

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ....bench.contracts import FloatArray, IntArray
 from ....bench.io.arrays import Member, read_arrays
 from ..geometry import border_edges, even_weights, smoothstep, vertex_normals
-from .anatomy import (
+from .sculpture import (
+    EAR_ORIGIN,
     EYE_CENTER,
     EYE_RADIUS,
     FLOOR,
@@ -24,11 +25,11 @@ from .anatomy import (
     MOUTH_CAVITY,
     MOUTH_HALF_WIDTH,
     canthal_height,
+    head_mass,
     lip_arc,
     lip_contour,
     slit_height,
 )
-from .sculpture import EAR_ORIGIN, head_mass
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
 PACKAGED = Path(__file__).with_name("head.npz")
@@ -36,24 +37,16 @@ PACKAGED = Path(__file__).with_name("head.npz")
 
 @dataclass(frozen=True, eq=False)
 class SculptedHead:
-    """Skin, left eyeball, right eyeball, in this order.
-
-    Attributes
-    ----------
-    vertices : FloatArray
-        (V, 3) float64, metres.
-    faces : IntArray
-        (F, 3) int64, counter-clockwise seen from outside.
-    mirror : IntArray
-        (V,) index of the mirror image of each vertex.
-    skin_count : int
-        Number of skin vertices; each eyeball has half of the rest.
-    """
+    """Skin, left eyeball, right eyeball, in this order."""
 
     vertices: FloatArray
+    """(V, 3) float64, metres."""
     faces: IntArray
+    """(F, 3) int64, counter-clockwise seen from outside."""
     mirror: IntArray
+    """(V,) index of the mirror image of each vertex."""
     skin_count: int
+    """Number of skin vertices; each eyeball has half of the rest."""
 
     @cached_property
     def eyeballs(self) -> tuple[IntArray, IntArray]:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from ....bench.contracts import FloatArray
 from ....bench.errors import InputError
+from ....bench.expressions import Expression
 from .expressions import (
     LIDS,
+    PAIRED,
     SEMANTIC_NAMES,
+    SIDEWAYS,
+    SINGLE,
     ExpressionBasis,
     keep_off_eyes,
     principal_basis,
@@ -75,3 +81,49 @@ def basis_of_version(shapes: dict[str, FloatArray], version: str) -> ExpressionB
     kept = {name: field for name, field in shapes.items() if version != "procedural2020" or name not in LIDS}
     deviation = np.array([0.30 if name in LIDS else 0.35 for name in kept])
     return principal_basis(kept, deviation, SEEDS[version])
+
+
+SIDES = (("_left", "_right"), ("_L", "_R"))
+"""Name suffixes of two mirrored shapes."""
+
+
+def named_expressions(version: str, names: Sequence[str], size: int) -> list[Expression]:
+    """Named expressions of a head model, with left and right combined; none for models like FLAME.
+
+    Blinks represented by eyelid bases are not included, since they are no expression coefficients.
+
+    ``version``: Of the head model. ``names``: Names of its expression directions; () if they have none. ``size``: E, the
+    number of expression directions.
+    """
+    if version in VERSIONS:
+        matrix, _ = semantic_to_coefficients(version)
+        if matrix.shape[1] == size:
+            return _procedural(dict(zip(SEMANTIC_NAMES, matrix)))
+    return _paired(dict(zip(names, np.eye(size))))
+
+
+def _procedural(rows: Mapping[str, FloatArray]) -> list[Expression]:
+    found = [_one_sided(name, rows[f"{name}_left"] + rows[f"{name}_right"]) for name in PAIRED]
+    found += [_one_sided(name, rows[name]) for name in SINGLE]
+    found += [
+        Expression(f"{name} sideways", rows[f"{name}_left"] - rows[f"{name}_right"], -1.0, 1.0)
+        for name in SIDEWAYS
+    ]
+    return [shape for shape in found if shape.direction.any()]
+
+
+def _paired(columns: Mapping[str, FloatArray]) -> list[Expression]:
+    found: dict[str, Expression] = {}
+    for name, column in columns.items():
+        both = [(left, right) for left, right in SIDES if name.endswith((left, right))]
+        stem = name.removesuffix(both[0][0]).removesuffix(both[0][1]) if both else name
+        pair = [stem + side for side in both[0]] if both else []
+        if pair and all(side in columns for side in pair):
+            found[stem] = _one_sided(stem, columns[pair[0]] + columns[pair[1]])
+        else:
+            found[name] = _one_sided(name, column)
+    return list(found.values())
+
+
+def _one_sided(name: str, direction: FloatArray) -> Expression:
+    return Expression(name.replace("_", " "), direction, 0.0, 1.0)

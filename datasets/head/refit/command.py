@@ -30,12 +30,11 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     A killed command continues at the last block of timesteps when it is run again.
 
     Writes under ``settings.out`` the capture (images linked), ``refit.json`` with every timestep's residuals and
-    ``heat_map.png``. Raises `InputError` before any fitting if capture and head model do not match.
+    ``heat_map.png``.
     """
     from ...clip import check_apart
     from ...images import write_image
-    from .heat_map import draw_heat_map
-    from .refit import refit
+    from .refit import draw_heat_map, refit
     from .rewrite import capture_plan, write_capture
 
     out = Path(settings.out)

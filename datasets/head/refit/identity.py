@@ -37,34 +37,22 @@ _MILLIMETRES = 1e3
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """Vertices of the target with their counterparts on the source.
-
-    Attributes
-    ----------
-    vertices : IntArray
-        (n,) vertices of the target, ascending.
-    weights : FloatArray
-        (n,) weights of their squared distances.
-    counterparts : csr_array
-        (n, V source) sparse; maps the source's vertices to points on its surface.
-    alignment : FloatArray
-        (4, 4) rigid motion from the source's model space to the target's.
-    shape : FloatArray
-        (S,) identity of the target.
-    """
+    """Vertices of the target with their counterparts on the source."""
 
     vertices: IntArray
+    """(n,) vertices of the target, ascending."""
     weights: FloatArray
+    """(n,) weights of their squared distances."""
     counterparts: csr_array
+    """(n, V source) sparse; maps the source's vertices to points on its surface."""
     alignment: FloatArray
+    """(4, 4) rigid motion from the source's model space to the target's."""
     shape: FloatArray
+    """(S,) identity of the target."""
 
 
 def fitted_vertices(head: HeadAsset, settings: RefitSettings) -> tuple[IntArray, FloatArray]:
-    """Vertices of the face and the eyeballs, (n,) ascending, and their weights (n,).
-
-    Raises `InputError` if the head has no face region.
-    """
+    """Vertices of the face and the eyeballs, (n,) ascending, and their weights (n,)."""
     weights = np.zeros(len(head.template))
     weights[region(head, FACE)] = 1.0
     for name, factor in (("lips", settings.lips), ("eye_region", settings.eye_region)):
@@ -89,10 +77,7 @@ def match(source: HeadAsset, neutral: FloatArray, target: HeadAsset, settings: R
     region by region, alternated with a rigid alignment and the identity, and initialised by aligning the centres of
     common regions.
 
-    Parameters
-    ----------
-    neutral : FloatArray
-        (V source, 3) metres.
+    ``neutral``: (V source, 3) metres.
     """
     vertices, weights = fitted_vertices(target, settings)
     if same_topology(source, target):

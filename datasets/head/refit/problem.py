@@ -72,14 +72,8 @@ class _Terms:
 class FitProblem:
     """The fit of one subject's head: expression, eyelids and angles to targets of some vertices.
 
-    Parameters
-    ----------
-    canonical : FloatArray
-        (V, 3) unposed neutral head, metres.
-    vertices : IntArray
-        (n,) vertices with targets.
-    weights : FloatArray
-        (n,) non-negative weights of the squared distances; only their ratios matter.
+    ``canonical``: (V, 3) unposed neutral head, metres. ``vertices``: (n,) vertices with targets. ``weights``: (n,)
+    non-negative weights of the squared distances; only their ratios matter.
     """
 
     def __init__(
@@ -124,12 +118,8 @@ class FitProblem:
     def frames(self, targets: FloatArray, necks: FloatArray) -> list[FrameTerms]:
         """Reduce the targets of T timesteps.
 
-        Parameters
-        ----------
-        targets : FloatArray
-            (T, n, 3) metres, in the frame of the head.
-        necks : FloatArray
-            (T, 3, 3) rotations of the neck joint; used only if the settings keep them.
+        ``targets``: (T, n, 3) metres, in the frame of the head. ``necks``: (T, 3, 3) rotations of the neck joint; used only if
+        the settings keep them.
         """
         wanted = _MILLIMETRES * np.asarray(targets, dtype=np.float64)
         weighted = wanted * self._share[:, None]
@@ -293,12 +283,7 @@ def solve_bounded(gram: FloatArray, right: FloatArray, bound: FloatArray) -> Flo
     constraints", SIAM J. Control Optim. 20, 1982): components held at their bound by the gradient are fixed, the
     others take a Newton step, shortened until it descends. Without active bounds that is one Cholesky solution.
 
-    Parameters
-    ----------
-    gram : FloatArray
-        (n, n) symmetric positive definite; only the lower triangle is read.
-    bound : FloatArray
-        (n,) positive.
+    ``gram``: (n, n) symmetric positive definite; only the lower triangle is read. ``bound``: (n,) positive.
     """
     x = _solve(gram, right)
     if (np.abs(x) <= bound).all():
@@ -361,12 +346,8 @@ def solve_frame(
 ) -> Solution:
     """Fit one timestep.
 
-    Parameters
-    ----------
-    start : FloatArray
-        (9,) initial angles, such as the previous timestep's.
-    fixed : FloatArray
-        (9,) values of the angles that move no vertex with a target, which are not optimised.
+    ``start``: (9,) initial angles, such as the previous timestep's. ``fixed``: (9,) values of the angles that move no
+    vertex with a target, which are not optimised.
     """
     searched, limit = problem.searched, angle_bounds(settings)
     scale = problem.scale[searched]

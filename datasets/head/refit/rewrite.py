@@ -22,12 +22,6 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
 
     Frames keep their sequence and camera; splits, exclusions and background are unchanged. The timesteps of a sequence
     are renumbered from 0 without a gap, as the layout requires.
-
-    Raises
-    ------
-    InputError
-        The layout cannot represent the clip: a camera lacks a frame at some timestep, splits are not
-        defined by held-out timesteps and cameras, or exclusions are not of whole timesteps.
     """
     plan, index = capture_plan(clip)
     writer = CaptureWriter(out, plan)
@@ -44,10 +38,7 @@ def write_capture(clip: CaptureClip, out: Path, progress: Progress = no_progress
 
 
 def capture_plan(clip: CaptureClip, source: str | Path = "") -> tuple[CapturePlan, dict[int, int]]:
-    """Plan of the capture for a clip, and each timestep's number in its sequence.
-
-    Raises `InputError` as `write_capture` does, naming ``source``, the capture the clip was read from.
-    """
+    """Plan of the capture for a clip, and each timestep's number in its sequence."""
     where = str(source) or f"clip of {clip.subject}"
     require_full_grid(clip, where)
     _check_excluded(clip, where)

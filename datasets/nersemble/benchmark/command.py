@@ -41,8 +41,7 @@ def submission_write(
     data : str | None
         The benchmark's folder, whose tracking has the number of frames of each sequence. Without it, the published totals are checked.
     """
-    from .submission import after_encoding, decibels, find_frames, write_submission
-    from .tracks import TRACKS
+    from .submission import TRACKS, after_encoding, decibels, find_frames, write_submission
 
     task, out = TRACKS[track], Path(zip)
     found = find_frames(Path(frames), task, method, None if data is None else Path(data))

@@ -21,7 +21,7 @@ from ...head.arrays import HeadArrays, read_head
 from ...head.loaders import load_head
 from ...head.teeth import with_teeth_where_possible
 from ..recording import read_calibration
-from .tracks import MEMBERS, MONO, BenchmarkTrack, tracking_file
+from .submission import MEMBERS, MONO, BenchmarkTrack, tracking_file
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,7 @@ def read_sequence(
 ) -> BenchmarkSequence:
     """Read cameras and tracking of a sequence from the benchmark's folder.
 
-    Parameters
-    ----------
-    head : HeadArrays
-        FLAME 2023 with or without teeth; coefficients are padded with zeros to its bases.
+    ``head``: FLAME 2023 with or without teeth; coefficients are padded with zeros to its bases.
     """
     path = tracking_file(data, participant, sequence)
     arrays = read_arrays(path, MEMBERS)
@@ -141,11 +138,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 @command("submission render", group="export", writes="out")
 def render_participant(settings: SubmissionRenderSettings, progress: Progress = no_progress) -> CommandResult:
-    """Render the test frames of a NeRSemble benchmark participant.
-
-    Raises `InputError` for an unknown participant, an avatar that cannot be read, and tracking or cameras that are missing or
-    damaged, all before the first frame.
-    """
+    """Render the test frames of a NeRSemble benchmark participant."""
     if settings.participant not in MONO.sequences:
         expected = f"one of {', '.join(MONO.sequences)}"
         raise InputError("command line", "--participant", expected, repr(settings.participant))

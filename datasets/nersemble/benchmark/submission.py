@@ -7,21 +7,128 @@ import re
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
 
 from ....bench.contracts import ByteArray, Progress
 from ....bench.errors import InputError
+from ....bench.io.arrays import Member, read_arrays
 from ....bench.io.files import atomic_path, check_writable, reading
 from ....bench.io.images import encode_h264, ffmpeg, probe_image, read_png
 from ..sequence import open_video, probe_video
-from .tracks import CRF, TRACKS, BenchmarkTrack, Video
+
+TrackName = Literal["nvs", "mono_flame_avatar"]
+TRACKING_FILE = "flame2023_tracking_v2.npz"
+"""File of the second version of the track; submissions by the first one, without ``_v2``, are no longer accepted."""
+CRF = 14
+"""Constant rate factor of H.264 that submissions are encoded with."""
+
+
+class Video(NamedTuple):
+    """A video of a submission; ``frames`` is None if the number is only in the benchmark's files."""
+
+    participant: str
+    sequence: str
+    serial: str
+    frames: int | None
+
+    @property
+    def name(self) -> str:
+        """Its name in the zip."""
+        return f"{self.participant}/{self.sequence}/cam_{self.serial}.mp4"
+
+
+@dataclass(frozen=True)
+class BenchmarkTrack:
+    """A task of the benchmark."""
+
+    name: TrackName
+    """Name of the folder in the benchmark's data."""
+    size: tuple[int, int]
+    """(width, height) in pixels."""
+    fps: float
+    sequences: Mapping[str, Mapping[str, int | None]]
+    """Sequences to render, by participant, with the number of frames if it is published."""
+    serials: tuple[str, ...]
+    totals: Mapping[str, int] | None = None
+    """Published number of frames of all sequences of a participant together."""
+
+    def videos(self, data: Path | None = None) -> Iterator[Video]:
+        """All videos of a submission.
+
+        ``data`` is the benchmark's folder; its tracking gives the number of frames if that is not published.
+        """
+        for participant, sequences in self.sequences.items():
+            for sequence, frames in sequences.items():
+                count = frames
+                if count is None and data is not None:
+                    count = tracked_frames(tracking_file(data, participant, sequence))
+                for serial in self.serials:
+                    yield Video(participant, sequence, serial, count)
+
+
+_TEST_SEQUENCES = ("FREE", "EMO-1-shout+laugh", "SEN-09-frown_events_bad", "SEN-10-port_strong_smokey")
+NVS = BenchmarkTrack(
+    "nvs",
+    (1100, 1604),
+    73.0,
+    {
+        "388": {"GLASSES": 1118},
+        "422": {"EXP-2-eyes": 517},
+        "443": {"FREE": 1108},
+        "445": {"EXP-6-tongue-1": 514},
+        "475": {"HAIR": 259},
+    },
+    ("222200046", "222200037", "222200039"),
+)
+MONO = BenchmarkTrack(
+    "mono_flame_avatar",
+    (512, 512),
+    24.3,
+    {name: dict.fromkeys(_TEST_SEQUENCES) for name in ("393", "404", "461", "477", "486")},
+    ("222200037", "222200046", "220700191", "222200039"),
+    totals={"393": 816, "404": 665, "461": 486, "477": 530, "486": 608},
+)
+TRACKS: Mapping[TrackName, BenchmarkTrack] = {track.name: track for track in (NVS, MONO)}
+
+
+def tracking_file(data: Path, participant: str, sequence: str) -> Path:
+    """Tracking of a sequence in the benchmark's folder."""
+    folder = data / "mono_flame_avatar" / participant / "sequences" / sequence / "tracking"
+    path = folder / TRACKING_FILE
+    if not path.is_file():
+        old = (folder / TRACKING_FILE.replace("_v2", "")).is_file()
+        found = "that of version 1, which is no longer taken" if old else "no such file"
+        remedy = "Download it: nersemble-benchmark-download FOLDER mono_flame_avatar."
+        raise InputError(path, "", "the tracking of version 2", found, remedy)
+    return path
+
+
+MEMBERS = {
+    "shape": Member("f", (1, "shape")),
+    "expression": Member("f", ("T", "expression")),
+    "rotation": Member("f", ("T", 3)),
+    "rotation_matrices": Member("f", ("T", 3, 3)),
+    "translation": Member("f", ("T", 3)),
+    "jaw": Member("f", ("T", 3)),
+    "frames": Member("iuf", ("T",)),
+    "scale": Member("f", (1, 1)),
+    "neck": Member("f", ("T", 3)),
+    "eyes": Member("f", ("T", 6)),
+}
+"""Arrays of a tracking file, all of one length T."""
+
+
+def tracked_frames(path: Path) -> int:
+    """Timesteps of a tracking file."""
+    return len(read_arrays(path, MEMBERS)["expression"])
+
 
 COMPARED = 24
 """Number of evenly spaced frames of a video that are compared with the encoded ones."""
@@ -40,13 +147,8 @@ def find_frames(
     They are ``<folder>/<participant>/<sequence>_<timestep>_<serial>.png``, or those of a run's method:
     ``<folder>/<participant>/<method>/seed-<n>/renders/<task>/...``.
 
-    Parameters
-    ----------
-    method : str
-        Method to use from a run with several.
-    data : Path | None
-        The benchmark's folder, which gives the number of frames of a sequence if that is not
-        published.
+    ``method``: Method to use from a run with several. ``data``: The benchmark's folder, which gives the number of frames of
+    a sequence if that is not published.
     """
     found: dict[Video, list[Path]] = {}
     by_participant = {name: _by_camera(folder, name, method) for name in track.sequences}
@@ -215,13 +317,8 @@ def check_submission(
     """Check a zip like the server does (files, frame counts, sizes), and also decode every frame and check codec and
     rate.
 
-    Parameters
-    ----------
-    data : Path | None
-        The benchmark's folder; without it, frames of the monocular track are only compared with the
-        published totals.
-    name : str
-        Name of the track; "" takes the one with the most files in the zip.
+    ``data``: The benchmark's folder; without it, frames of the monocular track are only compared with the published totals.
+    ``name``: Name of the track; "" takes the one with the most files in the zip.
     """
     issues = Issues()
     with reading(file, "the zip of a submission"):

@@ -47,10 +47,7 @@ DECISIONS_FILE = "tongue.yaml"
 
 @command("prepare tongue", group="data", writes="out")
 def tongue(settings: TongueSettings, progress: Progress) -> CommandResult:
-    """Find the frames that show the tongue, for review on a contact sheet.
-
-    Raises `InputError` before any image is read, for captures and decisions that cannot be read.
-    """
+    """Find the frames that show the tongue, for review on a contact sheet."""
     from ..exclude import read_exclusions, write_exclusions
 
     _check(settings)
@@ -74,9 +71,8 @@ def _look(
     clip: CaptureClip, settings: TongueSettings, earlier: Exclusions | None, sheet: Path, progress: Progress
 ) -> Exclusions:
     """Decide on one subject and draw its contact sheet."""
-    from .evidence import decide, find_evidence
+    from .evidence import decide, find_evidence, write_sheet
     from .mouth import facing_cameras, frames_by_timestep, mouth_atlas, sample_clip
-    from .review import write_sheet
 
     overrides = earlier.overrides if earlier else {}
     frames = frames_by_timestep(clip)

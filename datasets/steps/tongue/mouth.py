@@ -30,7 +30,7 @@ from ....bench.machine import processor_count
 from ....bench.protocol import evenly_with_ends
 from ...head.arrays import JOINT_NAMES, region
 from ...head.geometry import vertex_normals
-from ...head.subject import PosedSubject
+from ...head.model import PosedSubject
 from ...mesh_pictures import rasterize_mesh
 
 PITCH = 0.0015
@@ -45,33 +45,22 @@ _FAR = 50.0  # metres; from there perspective is below a tenth of a millimetre
 
 @dataclass(frozen=True, eq=False)
 class MouthAtlas:
-    """A frontal map of the surface around a subject's mouth, H x W pixels of `PITCH`, row 0 on top.
-
-    Attributes
-    ----------
-    inside : np.ndarray
-        (H, W) whether the map has surface: the face's outside, facing front.
-    corners : IntArray
-        (N, 3) vertices of the triangle behind each pixel of ``inside``, in row-major order.
-    weights : FloatArray
-        (N, 3) barycentric weights on them.
-    lips : np.ndarray
-        (H, W) pixels of the lips.
-    below : np.ndarray
-        (H, W) pixels below the line where the lips meet: lower lip and chin.
-    height : FloatArray
-        (H, W) millimetres above the line where the lips meet, negative below.
-    occluders : IntArray
-        (F', 3) triangles that can hide the mouth from a camera in front of it.
-    """
+    """A frontal map of the surface around a subject's mouth, H x W pixels of `PITCH`, row 0 on top."""
 
     inside: np.ndarray
+    """(H, W) whether the map has surface: the face's outside, facing front."""
     corners: IntArray
+    """(N, 3) vertices of the triangle behind each pixel of ``inside``, in row-major order."""
     weights: FloatArray
+    """(N, 3) barycentric weights on them."""
     lips: np.ndarray
+    """(H, W) pixels of the lips."""
     below: np.ndarray
+    """(H, W) pixels below the line where the lips meet: lower lip and chin."""
     height: FloatArray
+    """(H, W) millimetres above the line where the lips meet, negative below."""
     occluders: IntArray
+    """(F', 3) triangles that can hide the mouth from a camera in front of it."""
 
     def points(self, vertices: FloatArray) -> FloatArray:
         """(N, 3) places of the map's pixels on a posed mesh (V, 3), metres."""
@@ -85,10 +74,7 @@ class MouthAtlas:
 
 
 def mouth_atlas(clip: Clip) -> MouthAtlas:
-    """Create the map for a clip's subject.
-
-    Raises `InputError` where the head lacks the regions "lips" or "face", or its lower lip does not follow the jaw.
-    """
+    """Create the map for a clip's subject."""
     head = clip.head
     where = f"head model {head.version!r}"
     lip_region, face = (region(head, name) for name in ("lips", "face"))
@@ -186,24 +172,16 @@ _MESHES = 32  # posed at once
 
 @dataclass(frozen=True, eq=False)
 class MouthColours:
-    """Colours of T timesteps in up to C cameras, in the map's layout.
-
-    Attributes
-    ----------
-    timesteps : Sequence[int]
-        Sorted timesteps.
-    cameras : Sequence[str]
-        Camera ids by position.
-    colours : ByteArray
-        (T, C, H, W, 3) 8-bit sRGB; 0 if not seen.
-    seen : np.ndarray
-        (T, C, H, W).
-    """
+    """Colours of T timesteps in up to C cameras, in the map's layout."""
 
     timesteps: Sequence[int]
+    """Sorted timesteps."""
     cameras: Sequence[str]
+    """Camera ids by position."""
     colours: ByteArray
+    """(T, C, H, W, 3) 8-bit sRGB; 0 if not seen."""
     seen: np.ndarray
+    """(T, C, H, W)."""
 
 
 def frames_by_timestep(clip: Clip) -> dict[int, dict[str, FrameKey]]:
@@ -215,10 +193,7 @@ def frames_by_timestep(clip: Clip) -> dict[int, dict[str, FrameKey]]:
 
 
 def facing_cameras(clip: Clip, atlas: MouthAtlas, count: int) -> list[str]:
-    """Ids of the ``count`` cameras that the mouth faces most, over poses spread along the clip.
-
-    Raises `InputError` if it faces none within 55 degrees.
-    """
+    """Ids of the ``count`` cameras that the mouth faces most, over poses spread along the clip."""
     timesteps = list(frames_by_timestep(clip))
     spread = evenly_with_ends(timesteps, 15)
     cosines: dict[str, list[float]] = {camera: [] for camera in clip.cameras}

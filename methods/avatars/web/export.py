@@ -28,7 +28,7 @@ from ....bench.protocol import evenly_with_ends
 from ....bench.specs import CommandResult, ResolutionRule, command
 from ....datasets.head.arrays import HeadArrays
 from ....datasets.head.rotations import matrix_to_quaternion
-from ....datasets.novelty import displacement_metric
+from ....datasets.inspect.statistics import displacement_metric
 from ...shared.avatar_files import read_shared_head
 from ...shared.rendering import view_of
 from ...splats import rasterize

@@ -18,7 +18,7 @@ from ....bench.io.arrays import read_npy
 from ....bench.io.files import atomic_path, read_bytes, write_bytes, write_text
 from ....bench.io.images import read_png
 from ....datasets.head.arrays import faces_in_region
-from ....datasets.head.subject import PosedSubject
+from ....datasets.head.model import PosedSubject
 from ....datasets.head.teeth import with_teeth_where_possible
 from ....datasets.images import write_image
 from ...gbs.spec import BlendshapeTraining, GBSConfig

@@ -26,7 +26,7 @@ from ....bench.contracts import (
 )
 from ....bench.errors import InputError
 from ....bench.io.files import read_bytes, write_bytes, write_json, write_text
-from ....datasets.head.subject import BATCH, PosedSubject, pose_in_head_frame
+from ....datasets.head.model import BATCH, PosedSubject, pose_in_head_frame
 from ....datasets.images import write_image
 from ...insta.marching import bare_triangles, mouth_triangles
 from ...insta.spec import InstaConfig

@@ -15,8 +15,7 @@ from ....bench.contracts import Clip, FloatArray, FrameKey, HeadAsset, Progress
 from ....bench.errors import InputError
 from ....datasets.ga.writer import save_npz
 from ....datasets.head.teeth import RING_LENGTH
-from ....datasets.steps.clusters import cluster_expressions
-from ....datasets.steps.jaw_bases import DEFAULT_COUNT, jaw_bases
+from ....datasets.steps.clusters import DEFAULT_COUNT, cluster_expressions, jaw_bases
 from ...shared.avatar_files import SUBJECT_FILE, read_shared_head
 from ...shared.config import PAPER_ITERATIONS
 from ...shared.loop import Fit

@@ -16,10 +16,15 @@ from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.colmap.command import ExportColmapSettings, export_colmap
 from headbench.datasets.colmap.model import read_model
-from headbench.datasets.colmap.reader import model_cameras, model_lenses
-from headbench.datasets.colmap.writer import export_model, export_tracking, image_name
+from headbench.datasets.colmap.reader import (
+    export_model,
+    export_tracking,
+    image_name,
+    model_cameras,
+    model_lenses,
+)
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.open import open_clip
 
 from ..tiny_capture import projected

@@ -8,9 +8,8 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.drive.formats import read_signal
-from headbench.datasets.drive.live import LiveDriver
 from headbench.datasets.drive.signal import SignalRequest
-from headbench.datasets.drive.transfer import transfer
+from headbench.datasets.drive.transfer import LiveDriver, transfer
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.teeth import with_teeth
 

@@ -7,16 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.datasets.drive.blendshapes import ARKIT, JAW_OPEN
 from headbench.datasets.drive.formats import read_signal
-from headbench.datasets.drive.signal import SignalRequest
+from headbench.datasets.drive.signal import ARKIT, JAW_OPEN, SignalRequest
 from headbench.datasets.drive.transfer import transfer
 from headbench.datasets.ga.writer import save_npz
 from headbench.datasets.head.arrays import save_head
+from headbench.datasets.head.model import pose_in_head_frame
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.head.procedural.surface import load_sculpture
 from headbench.datasets.head.procedural.versions import version_shapes
-from headbench.datasets.head.subject import pose_in_head_frame
 
 from ..head.refit.heads import subdivided
 from ..head.skinning import skinned

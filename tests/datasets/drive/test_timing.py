@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.drive.blendshapes import JAW_OPEN
 from headbench.datasets.drive.formats import read_signal
-from headbench.datasets.drive.signal import SignalRequest
+from headbench.datasets.drive.signal import JAW_OPEN, SignalRequest
 from headbench.datasets.drive.timing import Timing
 from headbench.datasets.drive.transfer import resampled
+from headbench.datasets.head.model import resting
 from headbench.datasets.head.procedural.model import procedural_head
-from headbench.datasets.head.subject import resting
 
 from ..head.toy import toy_head
 

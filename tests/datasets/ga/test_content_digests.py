@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from headbench.bench.io.files import digest
-from headbench.datasets.ga import content_digests as module
-from headbench.datasets.ga.content_digests import content_digests
+from headbench.datasets.ga import validate as module
 from headbench.datasets.ga.layout import Declaration
 from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.ga.validate import content_digests
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Camera
-from headbench.datasets.ga.principal_point import CyEvidence, OutlineView, weigh_cy
+from headbench.datasets.ga.cameras import CyEvidence, OutlineView, weigh_cy
 
 from ..head.toy import toy_head
 from ..tiny_capture import look_at, projected, silhouette

@@ -7,8 +7,13 @@ import pytest
 import torch
 
 from headbench.bench.contracts import Camera, HeadPose
-from headbench.datasets.head.model import HeadModel
-from headbench.datasets.head.subject import BATCH, PosedSubject, camera_in_head_frame, pose_in_head_frame
+from headbench.datasets.head.model import (
+    BATCH,
+    HeadModel,
+    PosedSubject,
+    camera_in_head_frame,
+    pose_in_head_frame,
+)
 
 from .toy import toy_head
 

@@ -10,7 +10,7 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.bench.io.figures import pixels
 from headbench.datasets.figures import HELD_OUT, TRAIN, hexadecimal, new_figure
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.inspect.command import NUMBERS, PICTURE, InspectSettings, inspect
 from headbench.datasets.inspect.figure import (
     draw_rig,

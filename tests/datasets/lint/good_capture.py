@@ -14,7 +14,7 @@ import numpy as np
 from headbench.bench.contracts import Camera, HeadPose
 from headbench.datasets.ga.writer import CapturePlan, CaptureWriter, SequencePlan
 from headbench.datasets.head.arrays import HeadArrays
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
 from headbench.datasets.mesh_pictures import rasterize_mesh
 

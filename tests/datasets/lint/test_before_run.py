@@ -6,8 +6,7 @@ import pytest
 from headbench.bench.contracts import no_progress
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.lint.before_run import errors
-from headbench.datasets.lint.catalogue import RULES
+from headbench.datasets.lint.catalogue import RULES, errors
 from headbench.datasets.lint.evidence import Evidence
 from headbench.datasets.lint.settings import LintSettings
 from headbench.datasets.steps.masks import set_background

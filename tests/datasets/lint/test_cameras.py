@@ -15,8 +15,7 @@ from headbench.bench.contracts import Camera
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.ga.writer import SequencePlan
 from headbench.datasets.images import read_image
-from headbench.datasets.lint.before_run import errors
-from headbench.datasets.lint.catalogue import RULES
+from headbench.datasets.lint.catalogue import RULES, errors
 from headbench.datasets.lint.command import lint_capture
 from headbench.datasets.lint.settings import LintSettings
 

@@ -12,8 +12,7 @@ from headbench.datasets.ga.layout import Declaration
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.ga.writer import SequencePlan
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.lint.before_run import errors
-from headbench.datasets.lint.catalogue import GROUPS, RULES
+from headbench.datasets.lint.catalogue import GROUPS, RULES, errors
 from headbench.datasets.lint.command import lint_capture
 from headbench.datasets.lint.rules import apply
 from headbench.datasets.lint.settings import LintSettings

@@ -13,8 +13,8 @@ from headbench.bench.errors import InputError
 from headbench.bench.protocol import make_protocols
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.head.subject import PosedSubject
-from headbench.datasets.lint.before_run import errors
+from headbench.datasets.head.model import PosedSubject
+from headbench.datasets.lint.catalogue import errors
 from headbench.datasets.monocular.clip import CONVENTION, _last
 from headbench.datasets.monocular.reader import find_videos, read_video
 from headbench.datasets.open import find_reader, open_clip

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.contracts import Camera, HeadPose
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import HeadArrays, save_head
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 
 from ..tiny_capture import FRONTAL, make_plan, rig, write_tiny_capture
 

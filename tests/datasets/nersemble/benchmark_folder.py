@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.head.arrays import HeadArrays
-from headbench.datasets.nersemble.benchmark.tracks import MONO, TRACKING_FILE
+from headbench.datasets.nersemble.benchmark.submission import MONO, TRACKING_FILE
 
 SCALE = 4.0
 

@@ -10,7 +10,7 @@ from headbench.bench.contracts import Camera
 from headbench.bench.io.files import write_json, write_text
 from headbench.datasets.head.arrays import HeadArrays, save_head
 from headbench.datasets.images import write_image
-from headbench.datasets.nersemble.settings import PrepareSettings
+from headbench.datasets.nersemble.names import PrepareSettings
 
 from ..head.toy import toy_head
 from ..tiny_capture import rig

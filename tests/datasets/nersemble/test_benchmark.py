@@ -18,12 +18,18 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.images import write_png
 from headbench.bench.specs import MethodSpec, ResolutionRule
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.head.subject import PosedSubject
-from headbench.datasets.nersemble.benchmark import tracks
+from headbench.datasets.head.model import PosedSubject
+from headbench.datasets.nersemble.benchmark import submission
 from headbench.datasets.nersemble.benchmark.command import submission_write
 from headbench.datasets.nersemble.benchmark.render import read_sequence
-from headbench.datasets.nersemble.benchmark.submission import after_encoding, check_submission, decibels
-from headbench.datasets.nersemble.benchmark.tracks import MONO, NVS, tracking_file
+from headbench.datasets.nersemble.benchmark.submission import (
+    MONO,
+    NVS,
+    after_encoding,
+    check_submission,
+    decibels,
+    tracking_file,
+)
 
 from ..head.toy import toy_head
 from ..tiny_capture import edit_json
@@ -131,7 +137,7 @@ def track(monkeypatch):
         serials=MONO.serials[:2],
         totals={"393": 2 * FRAMES},
     )
-    monkeypatch.setattr(tracks, "TRACKS", {MONO.name: small})
+    monkeypatch.setattr(submission, "TRACKS", {MONO.name: small})
     monkeypatch.setattr("headbench.datasets.nersemble.benchmark.submission.TRACKS", {MONO.name: small})
     return small
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from headbench.bench.errors import InputError
+from headbench.datasets.images import srgb_to_linear
 from headbench.datasets.nersemble.pixels import (
     POLYNOMIALS,
     AffineCorrection,
@@ -15,7 +16,6 @@ from headbench.datasets.nersemble.pixels import (
     linear_to_srgb,
     polynomial_correction,
 )
-from headbench.datasets.srgb import srgb_to_linear
 
 # sum over i of (i + 1) * term i of colour-science 0.4.7's matrix_augmented_Cheung2004 at RGB (0.7, 0.3, 0.11).
 WEIGHTED_SUMS = {

@@ -15,7 +15,7 @@ from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import read_head, save_head
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.nersemble import prepare, sequence
 from headbench.datasets.nersemble import prepare as image_pool
 from headbench.datasets.nersemble.command import prepare_nersemble

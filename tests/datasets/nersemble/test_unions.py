@@ -8,9 +8,8 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga.layout import DECLARATION_FILE
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.nersemble.command import prepare_nersemble
-from headbench.datasets.nersemble.names import UNION10_SEQUENCES, union10_held_out
+from headbench.datasets.nersemble.names import UNION10_SEQUENCES, PrepareSettings, union10_held_out
 from headbench.datasets.nersemble.prepare import RECORD_FILE
-from headbench.datasets.nersemble.settings import PrepareSettings
 
 from ..tiny_capture import edit_json
 from .recordings import SUBJECT, write_recording

@@ -3,7 +3,7 @@
 import numpy as np
 
 from headbench.bench.engine.config import RunConfig
-from headbench.datasets.steps.charted import packed_chart, with_packed_chart
+from headbench.datasets.steps.rest import packed_chart, with_packed_chart
 
 CONFIG = RunConfig(data="", out="")
 

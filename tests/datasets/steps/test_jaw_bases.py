@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from headbench.bench.contracts import FrameKey
-from headbench.datasets.steps.jaw_bases import (
+from headbench.datasets.steps.clusters import (
     HALF_TURN,
     IDENTITY,
     farthest_quaternions,

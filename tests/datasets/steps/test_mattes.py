@@ -14,8 +14,9 @@ from headbench.bench.errors import InputError
 from headbench.bench.manifest import cut_of
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.clip import FrameFiles
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.images import ImageStore, write_image
+from headbench.datasets.steps.for_method import align_clip
 from headbench.datasets.steps.masks import (
     NeckLine,
     composite,
@@ -26,7 +27,6 @@ from headbench.datasets.steps.masks import (
     set_background,
     without_torso,
 )
-from headbench.datasets.steps.resolution import align_clip
 
 from ..tiny_capture import projected
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from headbench.bench.engine.config import RunConfig
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.steps.for_method import as_single_video
-from headbench.datasets.steps.rigid import as_rigid_head
+from headbench.datasets.steps.rest import as_rigid_head
 
 from ..tiny_capture import projected
 

@@ -15,6 +15,7 @@ from headbench.bench.io.documents import read_json
 from headbench.bench.io.figures import pixels
 from headbench.datasets.figures import new_figure
 from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.inspect.command import StepsSettings, steps
 from headbench.datasets.steps.figures import (
     cluster_colour,
     draw_meshes,
@@ -23,7 +24,6 @@ from headbench.datasets.steps.figures import (
     frontal_key,
     unposed_meshes,
 )
-from headbench.datasets.steps.pictures.command import StepsSettings, steps
 
 from .clips import make_clip, with_poses
 

@@ -6,7 +6,7 @@ import pytest
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
 from headbench.bench.specs import ResolutionRule
-from headbench.datasets.steps.resolution import Alignment, PixelBox, align_clip, take_box
+from headbench.datasets.steps.for_method import Alignment, PixelBox, align_clip, take_box
 
 WHITE = (1.0, 1.0, 1.0)
 RULES = {

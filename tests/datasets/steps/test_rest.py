@@ -5,7 +5,7 @@ import pytest
 
 from headbench.bench.engine.config import RunConfig
 from headbench.bench.errors import InputError
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.steps.rest import with_rest_expression
 
 CONFIG = RunConfig(data="", out="")

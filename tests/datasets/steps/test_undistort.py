@@ -6,7 +6,7 @@ import pytest
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
-from headbench.datasets.steps.undistort import Lens, undistort_clip, undistort_image
+from headbench.datasets.colmap.model import Lens, undistort_clip, undistort_image
 
 WIDTH, HEIGHT = 240, 320
 LENSES = {

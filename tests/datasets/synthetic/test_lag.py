@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from headbench.datasets.synthetic.hair import STYLES
-from headbench.datasets.synthetic.lag import (
+from headbench.datasets.synthetic.history import (
     FOLLOWED,
     HAIR_DAMPING,
     NECK_DAMPING,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import FloatArray, HeadPose
-from headbench.datasets.novelty import novelty
+from headbench.datasets.inspect.statistics import novelty
 from headbench.datasets.synthetic.natural import BLINK_GAP, FRAME_RATE, blinks
 from headbench.datasets.synthetic.performance import (
     CONTROLS,

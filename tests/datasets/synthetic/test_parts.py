@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Camera
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.mesh_pictures import rasterize_mesh
 from headbench.datasets.synthetic.anatomy import front_depth, measure
 from headbench.datasets.synthetic.parts import HIDES, share_that_shows

@@ -8,12 +8,12 @@ import pytest
 from headbench.bench.contracts import StepRecord
 from headbench.bench.errors import UnavailableError
 from headbench.bench.registry import get, resolve
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.open import open_clip
 from headbench.datasets.synthetic import capture
 from headbench.datasets.synthetic.performance import EXPRESSION_CONTROLS
 from headbench.datasets.synthetic.plan import FRONTAL
-from headbench.datasets.synthetic.truth import SyntheticTruth
+from headbench.datasets.synthetic.renderer import SyntheticTruth
 
 from .conftest import SMALL
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from headbench.datasets.head.arrays import save_head
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 
 from ..monocular.videos import Recording, six_numbers
 

@@ -10,8 +10,7 @@ from headbench.bench.io.files import TEMPORARY
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.images import read_image
 from headbench.datasets.tracking.command import track_capture
-from headbench.datasets.tracking.settings import TrackSettings
-from headbench.datasets.tracking.work import WORK, make_work_folder
+from headbench.datasets.tracking.settings import WORK, TrackSettings, make_work_folder
 
 
 @pytest.fixture(scope="module")

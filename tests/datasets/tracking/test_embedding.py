@@ -5,9 +5,13 @@ import pytest
 
 from headbench.bench.landmark_network import COUNT
 from headbench.datasets.head.procedural.model import procedural_head
-from headbench.datasets.tracking.embedding import learn_embedding
-from headbench.datasets.tracking.landmarks import spread_vertices
-from headbench.datasets.tracking.network import AZIMUTHS, ELEVATIONS, drawn_head
+from headbench.datasets.tracking.landmarks import (
+    AZIMUTHS,
+    ELEVATIONS,
+    drawn_head,
+    learn_embedding,
+    spread_vertices,
+)
 
 from ..tiny_capture import projected
 

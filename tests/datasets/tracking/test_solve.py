@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from headbench.datasets.head.model import HeadModel
+from headbench.datasets.tracking.fit import HeadPrior, HeadState, NormalEquations
 from headbench.datasets.tracking.rig import ANGLES, PointRig, PoseColumns, PosedPoints
-from headbench.datasets.tracking.solve import HeadPrior, HeadState, NormalEquations
 
 from ..head.toy import toy_head
 

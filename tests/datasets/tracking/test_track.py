@@ -8,16 +8,13 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.tracking import track as track_module
 from headbench.datasets.tracking.fit import Fitter
-from headbench.datasets.tracking.images import FrameStack
 from headbench.datasets.tracking.landmarks import known_rig_landmarks, spread_vertices
-from headbench.datasets.tracking.outliers import outliers
-from headbench.datasets.tracking.rig import PoseColumns
-from headbench.datasets.tracking.track import track
-from headbench.datasets.tracking.views import Views
-from headbench.datasets.tracking_errors import mesh_errors
+from headbench.datasets.tracking.rig import PoseColumns, outliers
+from headbench.datasets.tracking.track import mesh_errors, track
+from headbench.datasets.tracking.views import FrameStack, Views
 
 
 def ramp(width, height, along, across):

@@ -9,7 +9,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.tracked_clip import FOLDER, with_tracking
+from headbench.datasets.tracking.track import FOLDER, with_tracking
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def clip(patterned_capture):
 def test_the_clip_has_other_tracking_and_the_same_frames(clip, tmp_path, monkeypatch):
     config = SimpleNamespace(out=str(tmp_path))
     one = with_tracking(clip, config, seed=1)
-    monkeypatch.setattr("headbench.datasets.tracked_clip.track", None)  # the parameters are kept
+    monkeypatch.setattr("headbench.datasets.tracking.track.track", None)  # the parameters are kept
     two = with_tracking(clip, config, seed=1)
     assert one.splits == clip.splits
     assert one.fingerprint == two.fingerprint != clip.fingerprint

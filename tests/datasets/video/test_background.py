@@ -10,12 +10,17 @@ import pytest
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
+from headbench.datasets.tracking.settings import VideoOptions
 from headbench.datasets.video import clip as video_masks
-from headbench.datasets.video.background import check_background, learn_background
-from headbench.datasets.video.clip import FrameView, MaskSource, SelfieSegmentation
+from headbench.datasets.video.clip import (
+    FrameView,
+    MaskSource,
+    SelfieSegmentation,
+    check_background,
+    learn_background,
+)
 from headbench.datasets.video.decode import TimedFrame
 from headbench.datasets.video.faces import Crop, FoundFaces
-from headbench.datasets.video.settings import VideoOptions
 
 from ..tiny_capture import look_at
 

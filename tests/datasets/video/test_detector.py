@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.landmark_network import COUNT, CROP, FaceCrop
-from headbench.datasets.video.detector import ANCHORS, SIDE, FaceDetector, FaceFinder
+from headbench.datasets.video.faces import ANCHORS, SIDE, FaceDetector, FaceFinder
 
 FACE, SEEN = (255, 255, 255), (SIDE / 15, SIDE / 1.8)
 """Colour of a face, and the sides that the network sees."""

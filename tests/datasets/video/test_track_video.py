@@ -20,12 +20,11 @@ from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.images import write_image
 from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
 from headbench.datasets.tracking import command as tracking_command
-from headbench.datasets.tracking import fit, focal, network, track
+from headbench.datasets.tracking import fit, landmarks, track
 from headbench.datasets.tracking.command import track_capture
-from headbench.datasets.tracking.focal import FocalLength, estimate_focal
+from headbench.datasets.tracking.fit import FocalLength, estimate_focal
 from headbench.datasets.tracking.landmarks import ImageLandmarks, spread_vertices
-from headbench.datasets.tracking.settings import TrackSettings
-from headbench.datasets.tracking.work import WORK
+from headbench.datasets.tracking.settings import WORK, TrackSettings
 from headbench.datasets.video import clip as video_clip
 from headbench.datasets.video import command, faces
 from headbench.datasets.video.decode import video_frames
@@ -121,7 +120,7 @@ def settings(filmed, monkeypatch, tmp_path):
             return [] if self.find(image) is None else [self.find(image)]
 
     monkeypatch.setattr(fit, "LEVELS", fit.LEVELS[:1])  # landmarks alone are exact here
-    monkeypatch.setattr(focal, "TRIED", focal.TRIED[1:6:2])
+    monkeypatch.setattr(fit, "TRIED", fit.TRIED[1:6:2])
     monkeypatch.setattr(command, "FaceFinder", Network)
     monkeypatch.setattr(video_clip, "crop_around", lambda faces, width, height: Crop(0, 0, width, height))
     given = {
@@ -178,7 +177,7 @@ def test_what_is_missing_is_said(settings, changes, named):
 
 
 def test_a_face_unlike_the_head_model_is_refused(settings, monkeypatch):
-    monkeypatch.setattr(network, "MOST_MISFIT", 0.0)  # as for a drawn face
+    monkeypatch.setattr(landmarks, "MOST_MISFIT", 0.0)  # as for a drawn face
     with pytest.raises(InputError, match="fit the head model in at least 50%.*it in 0 of 11"):
         track_capture(settings(focal=None))
 

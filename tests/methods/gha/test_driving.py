@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from headbench.datasets.head.model import HeadModel
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import HeadModel, PosedSubject
 from headbench.methods.gha.driving import (
     Driver,
     bounds,

@@ -10,7 +10,7 @@ import torch
 from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.datasets.srgb import srgb_to_linear
+from headbench.datasets.images import srgb_to_linear
 from headbench.methods.insta import avatar as avatar_module
 from headbench.methods.insta import kernel
 from headbench.methods.insta.avatar import FIELD_FILE, SETTINGS_FILE, InstaAvatar

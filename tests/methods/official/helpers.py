@@ -8,8 +8,9 @@ import torch
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.engine.scoring import TrainingView
 from headbench.bench.io.arrays import check_arrays
-from headbench.datasets.head.subject import PosedSubject
-from headbench.datasets.tracker_files.metrical import MEMBERS, metrical_frame
+from headbench.datasets.head.model import PosedSubject
+from headbench.datasets.nersemble.benchmark.submission import MEMBERS
+from headbench.datasets.tracker_files.formats import metrical_frame
 from headbench.methods.official.workplace import Workplace
 
 BUDGET = Budget(iterations=20)

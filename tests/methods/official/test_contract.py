@@ -15,7 +15,7 @@ from headbench.bench.engine.stored import avatar_digest
 from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json
 from headbench.bench.process import ProgramError
-from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
+from headbench.datasets.head.model import PosedSubject, pose_in_head_frame
 from headbench.methods.official import needs
 from headbench.methods.official.checkout import Repository, inspect_checkout
 from headbench.methods.official.flashavatar import method as flashavatar

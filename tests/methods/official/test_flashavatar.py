@@ -9,7 +9,7 @@ import torch
 
 from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_pixels
-from headbench.datasets.head.subject import pose_in_head_frame
+from headbench.datasets.head.model import pose_in_head_frame
 from headbench.methods.flashavatar.method import FlashAvatarTraining
 from headbench.methods.flashavatar.model import layer_of_points, network_outputs
 from headbench.methods.flashavatar.spec import FlashAvatarConfig

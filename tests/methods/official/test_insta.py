@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from headbench.bench.io.documents import read_json
-from headbench.datasets.head.subject import PosedSubject, pose_in_head_frame
+from headbench.datasets.head.model import PosedSubject, pose_in_head_frame
 from headbench.datasets.monocular.insta import read_vertices
 from headbench.methods.official.insta.method import HAIR, MOUTH, SKIN
 

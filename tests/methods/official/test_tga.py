@@ -6,8 +6,7 @@ import pytest
 from headbench.bench.contracts import Budget
 from headbench.bench.errors import InputError
 from headbench.bench.io.arrays import read_npz
-from headbench.datasets.steps.clusters import cluster_expressions
-from headbench.datasets.steps.jaw_bases import jaw_quaternions
+from headbench.datasets.steps.clusters import cluster_expressions, jaw_quaternions
 
 from .helpers import BUDGET
 from .repository import LINES_BEGIN

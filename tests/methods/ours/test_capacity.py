@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.engine.scoring import TrainingView
 from headbench.bench.engine.stored import TRAINING_FILE
-from headbench.datasets.steps.jaw_bases import IDENTITY, farthest_quaternions, jaw_quaternions, jaw_weights
+from headbench.datasets.steps.clusters import IDENTITY, farthest_quaternions, jaw_quaternions, jaw_weights
 from headbench.methods.ours.method import (
     Ours,
     jaw_lever,

@@ -7,7 +7,7 @@ import pytest
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.datasets.head.subject import PosedSubject
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.mesh_pictures import draw_mesh
 from headbench.methods.trivial.method import (
     INDEX_FILE,

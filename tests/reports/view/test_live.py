@@ -103,7 +103,7 @@ def test_settings_take_a_port_or_a_dash(value):
 def test_avatars_show_the_poses_of_lines(scene, method):
     from dataclasses import replace
 
-    from headbench.datasets.drive.live import LiveDriver
+    from headbench.datasets.drive.transfer import LiveDriver
     from headbench.reports.view.drawing import pose_of
     from headbench.reports.view.scene import LIVE, State
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from headbench.datasets.head.geometry import border_edges
-from headbench.datasets.head.procedural.anatomy import lip_arc
-from headbench.datasets.head.procedural.parts import (
+from headbench.datasets.head.procedural.sculpture import lip_arc
+from headbench.datasets.synthetic.parts import (
     ARCH_REACH,
     LOWER_WIDTHS,
     UPPER_WIDTHS,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.head.refit import refit as block
 from headbench.datasets.head.refit.refit import BLOCK, refit
 from headbench.datasets.head.refit.settings import RefitSettings
-from headbench.datasets.head.subject import PosedSubject
 from headbench.datasets.head.teeth import with_teeth
 
 from ..toy import toy_head
