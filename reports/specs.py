@@ -27,7 +27,7 @@ PAPERS = ReportSpec(
 CITATIONS = ReportSpec(
     name="citations",
     summary="Source, citation and published values of every registered method.",
-    implementation="headbench.reports.method_cards:citations",
+    implementation="headbench.reports.papers:citations",
     writes=False,
 )
 
@@ -67,6 +67,6 @@ SUITE_REPORT = ReportSpec(
 ROBUSTNESS = ReportSpec(
     name="robustness",
     summary="Contact sheet and summary of the output of `run extremes` and `run reenact`.",
-    implementation="headbench.reports.robustness.sheets:robustness_report",
+    implementation="headbench.reports.contact_sheet:robustness_report",
     writes=False,
 )

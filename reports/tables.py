@@ -218,6 +218,8 @@ class Table:
         return any(column.metric == "fps" for column in self.columns)
 
 
+COMPARISON = "comparison"
+"""Name of the layout that every run has."""
 AVATAR_TITLE = "Avatar"
 TITLES = {"speed": "Speed", "cost": "Storage and training", "mechanism": "Mechanisms"}
 """Titles of layouts whose columns belong to no task."""

@@ -4,7 +4,7 @@ import json
 
 from headbench.bench.registry import discover
 from headbench.reports import method_cards
-from headbench.reports.method_cards import (
+from headbench.reports.papers import (
     citations,
     measured_figures,
     measured_text,

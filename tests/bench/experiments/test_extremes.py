@@ -24,7 +24,7 @@ from headbench.bench.experiments.specs import AGAINST_TRUTH
 from headbench.bench.experiments.specs import MEASURES as STABILITY
 from headbench.bench.io.images import read_png
 from headbench.bench.io.lock import locked
-from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED, SHEET_FILE
+from headbench.reports.contact_sheet import BROKEN, EXTRAPOLATED, SHEET_FILE
 
 VIEWS, SAMPLES, PATH_FRAMES = 4, 2, 2
 FRAMES = VIEWS + 2 * SAMPLES + PATH_FRAMES

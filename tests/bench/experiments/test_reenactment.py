@@ -15,7 +15,7 @@ from headbench.bench.errors import InputError
 from headbench.bench.experiments.reenactment import RigidMean, retarget
 from headbench.bench.experiments.robustness import RECORD_FILE, ReenactSettings, reenact_run
 from headbench.bench.io.images import read_png
-from headbench.reports.robustness.sheets import SHEET_FILE
+from headbench.reports.contact_sheet import SHEET_FILE
 
 
 def settings(folder, **changes):

@@ -17,7 +17,7 @@ from headbench.bench.experiments.robustness import ExtremesSettings
 from headbench.bench.experiments.truth import TRUTH_LIMITS, TruthJudge, TruthPair, TruthPictures
 from headbench.datasets.open import open_clip
 from headbench.datasets.synthetic.capture import synthesize
-from headbench.reports.robustness.sheets import SHEET_FILE, table, write_extremes_sheet
+from headbench.reports.contact_sheet import SHEET_FILE, table, write_extremes_sheet
 
 from ...datasets.flat_renderer import flat_pictures
 
