@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.reports.view import live as module
+from headbench.reports.view import server as module
 from headbench.reports.view.scene import ViewSettings
 from headbench.reports.view.server import LivePoses, local_port, standard_input
 
