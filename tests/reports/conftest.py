@@ -181,4 +181,4 @@ def write_run(tmp_path, write_manifest):
 def no_plots(monkeypatch):
     """Leave out the drawing of `report pareto`, which takes longer than all else it does."""
     for name in ("write_plot", "write_rates"):
-        monkeypatch.setattr(plot, name, lambda *args, **options: None)
+        monkeypatch.setattr(pareto, name, lambda *args, **options: None)
