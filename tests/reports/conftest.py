@@ -12,6 +12,7 @@ from headbench.bench.engine.store import RunFolder
 from headbench.bench.manifest import Manifest, MethodRecord, ProtocolRecord
 from headbench.bench.rows import Rows
 from headbench.bench.specs import MetricSpec
+from headbench.reports.pareto import command as pareto
 
 from ..world import run_on
 from .made_rows import TASKS, avatar_row, row
