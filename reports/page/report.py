@@ -255,7 +255,7 @@ def _opening(runs: RunSet, first: Opening) -> dict[str, Any]:
 def _ratio(runs: RunSet, first: Opening) -> str:
     """Width and height of the opening renders, for the page's style."""
     for label in first.methods:
-        run, name = runs.shown[label]
+        run, name = runs.pictured[label]
         path = None if first.frame is None else run.render_path(name, *first.frame)
         if path is not None:
             with suppress(InputError):

@@ -302,7 +302,7 @@ def loss_curves(runs: RunSet) -> list[dict[str, Any]]:
     """
     found = []
     for index, label in enumerate(runs.methods):
-        run, name = runs.shown[label]
+        run, name = runs.pictured[label]
         curves = []
         for clip in run.manifest.clips:
             try:

@@ -11,7 +11,7 @@ from scipy import stats
 from headbench.bench.manifest import MethodRecord
 from headbench.bench.rows import Rows
 from headbench.reports.runs import RunSet
-from headbench.reports.statistics import primary
+from headbench.reports.suite import suite as primary
 from headbench.reports.suite.suite import MARGINS, PAIR, PRIMARY, primary_comparisons, primary_section
 
 from ..conftest import LPIPS, PSNR
