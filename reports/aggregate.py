@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Literal
@@ -25,15 +26,12 @@ AVERAGED = "frames, then sequences, then subjects"
 
 @dataclass(frozen=True)
 class Aggregate:
-    """A mean; if it is missing, ``value`` is None and ``reason`` states why. With a value, ``reason`` lists what was left out.
-
-    ``spread`` is the standard deviation of the mean over seeds; None with one seed.
-    """
+    """A mean over frames, then sequences, subjects and seeds."""
 
     status: Literal["ok", "missing", "failed"]
     value: float | None
-    reason: str = ""
-    spread: float | None = None
+    reason: str = ""  # why the value is missing, or what it was taken without
+    spread: float | None = None  # standard deviation of the mean over seeds; None with one seed
 
 
 def whole_images(rows: Rows, method: str, metric: str, task: str) -> pd.DataFrame:
@@ -44,50 +42,46 @@ def whole_images(rows: Rows, method: str, metric: str, task: str) -> pd.DataFram
     return _judged(rows.select(method=method, metric=metric, task=task, region=FULL, seeds=ALL))
 
 
-def _judged(found: pd.DataFrame) -> pd.DataFrame:
+def _judged(rows: pd.DataFrame) -> pd.DataFrame:
     """Rows without frames that their metric left out, unless it left out all."""
-    missing = (found["status"] == "missing").to_numpy()
+    missing = (rows["status"] == "missing").to_numpy()
     if not missing.any():
-        return found
-    kept = ~(missing & found["reason"].str.startswith(LEFT_OUT).to_numpy())
-    return found[kept] if kept.any() else found
+        return rows
+    judged = ~(missing & rows["reason"].str.startswith(LEFT_OUT).to_numpy())
+    return rows[judged] if judged.any() else rows
 
 
 def summarise(rows: Rows, method: str, metric: str, task: str) -> Aggregate:
     """Aggregate `whole_images`; ``rows`` of all methods determine the frames (``task`` "": subjects)."""
     whole = rows.select(method=method, metric=metric, task=task, region=FULL, seeds=ALL)
-    mine = _judged(whole)
-    if mine.empty:
-        own = rows.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
-        failed = own[own["status"] == "failed"]
+    judged = _judged(whole)
+    if judged.empty:
+        every = rows.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+        failed = every[every["status"] == "failed"]
         if len(failed):
             return Aggregate("failed", None, _reason(failed))
         return Aggregate("missing", None, "Not measured: run the comparison with this method and metric.")
-    found = set(mine["status"])
-    for status in ("failed", "missing"):
-        if status in found:
-            without = mine[mine["status"] == status]
-            reason = _reason(without)
-            if len(without) < len(mine):
-                reason = f"{len(without)} of {len(mine)} values {status}: {reason}"
-            return Aggregate(status, None, reason)  # type: ignore[arg-type]
+    statuses: tuple[Literal["failed", "missing"], ...] = ("failed", "missing")
+    for status in statuses:
+        if len(without := judged[judged["status"] == status]):
+            count = f"{len(without)} of {len(judged)} values {status}: " * (len(without) < len(judged))
+            return Aggregate(status, None, count + _reason(without))
     expected = len(rows.frames(task, FULL) if task else rows.subjects) * len(rows.seeds(method))
-    left_out = whole[whole["status"] == "missing"]
-    gap = expected - len(whole)
-    if gap:
+    if gap := expected - len(whole):
         what = "frames" if task else "avatars"
         reason = f"{gap} of {expected} {what} have no value: run the comparison to its end."
         return Aggregate("missing", None, reason)
-    by_seed = [fmean(means.values()) for means in means_by_seed(mine).values()]
-    said = f"Without {len(left_out)} of {len(whole)} frames, {_reason(left_out)}." if len(left_out) else ""
-    return Aggregate("ok", fmean(by_seed), said, stdev(by_seed) if len(by_seed) > 1 else None)
+    by_seed = [fmean(means.values()) for means in means_by_seed(judged).values()]
+    left_out = whole[whole["status"] == "missing"]
+    reason = f"Without {len(left_out)} of {len(whole)} frames, {_reason(left_out)}." if len(left_out) else ""
+    return Aggregate("ok", fmean(by_seed), reason, stdev(by_seed) if len(by_seed) > 1 else None)
 
 
 def subject_means(rows: pd.DataFrame) -> dict[str, float]:
     """Mean of each subject: over frames of a sequence, then over sequences, then over seeds."""
     by_seed = means_by_seed(rows).values()
     subjects = sorted({subject for means in by_seed for subject in means})
-    return {each: fmean(means[each] for means in by_seed if each in means) for each in subjects}
+    return {name: fmean(means[name] for means in by_seed if name in means) for name in subjects}
 
 
 def means_by_seed(rows: pd.DataFrame) -> dict[int, dict[str, float]]:
@@ -111,10 +105,8 @@ def means_by_seed(rows: pd.DataFrame) -> dict[int, dict[str, float]]:
 def _reason(rows: pd.DataFrame) -> str:
     """The reason of the first row in a fixed order, as one line."""
     first = rows.sort_values(["seed", *FRAME]).iloc[0]
-    return (
-        " ".join(str(first["reason"]).split())
-        or f"The rows have the status {first['status']} without a reason."
-    )
+    reason = " ".join(str(first["reason"]).split())
+    return reason or f"The rows have the status {first['status']} without a reason."
 
 
 OTHERS_LIMIT = 0.1
@@ -128,21 +120,11 @@ Consecutive measurements on an idle machine differ by as much.
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions under which the times of one method were measured.
+    """Conditions under which the times of one method were measured."""
 
-    Attributes
-    ----------
-    places : frozenset[tuple[str, int]]
-        Pairs of machine and number of threads; empty if they were not recorded.
-    others : float
-        Maximum number of cores used by other processes, 0 if no load was recorded.
-    known : bool
-        Whether the load was recorded for all of them.
-    """
-
-    places: frozenset[tuple[str, int]]
-    others: float
-    known: bool
+    places: frozenset[tuple[str, int]]  # machine and number of threads; empty if they were not recorded
+    others: float  # maximum number of cores used by other processes, 0 if no load was recorded
+    known: bool  # whether the load was recorded for all of them
 
     @classmethod
     def of(cls, rows: pd.DataFrame) -> Conditions:
@@ -151,11 +133,6 @@ class Conditions:
         places = frozenset((str(m), int(t)) for m, t in zip(recorded["machine"], recorded["threads"]))
         others = rows["other_cores"].astype(float).dropna()
         return cls(places, float(others.max()) if len(others) else 0.0, len(others) == len(rows))
-
-    @property
-    def loaded(self) -> bool:
-        """Whether other processes used more than `OTHERS_LIMIT`."""
-        return self.others > OTHERS_LIMIT
 
     @property
     def text(self) -> str:
@@ -170,30 +147,30 @@ def conditions(
     rows: Rows, metrics: Sequence[MetricSpec], methods: Sequence[str]
 ) -> dict[str, dict[str, Conditions]]:
     """Conditions of each machine-dependent metric, by metric and method, for methods with a value."""
-    found: dict[str, dict[str, Conditions]] = {}
+    by_metric: dict[str, dict[str, Conditions]] = {}
     for metric in metrics:
         if metric.machine_bound and not metric.per_frame:
-            own = {method: whole_images(rows, method, metric.name, "") for method in methods}
-            measured = {method: table[table["status"] == "ok"] for method, table in own.items()}
-            found[metric.name] = {m: Conditions.of(table) for m, table in measured.items() if len(table)}
-    return found
+            tables = {method: whole_images(rows, method, metric.name, "") for method in methods}
+            measured = {method: table[table["status"] == "ok"] for method, table in tables.items()}
+            by_metric[metric.name] = {m: Conditions.of(table) for m, table in measured.items() if len(table)}
+    return by_metric
 
 
 def marks(
-    found: Mapping[str, Mapping[str, Conditions]], trivial: Sequence[str]
+    by_metric: Mapping[str, Mapping[str, Conditions]], trivial: Sequence[str]
 ) -> dict[tuple[str, str], str]:
     """The note for each metric and method whose time is not comparable with the others of its column.
 
     The note states the highest load in the column, so that its methods share a note.
     """
     notes = {}
-    for metric, by_method in found.items():
+    for metric, by_method in by_metric.items():
         places = [each.places for method, each in by_method.items() if method not in trivial and each.places]
         differ = len(set(places)) > 1
         most = max((each.others for each in by_method.values()), default=0.0)
         for method, each in by_method.items():
             note = []
-            if each.loaded:
+            if each.others > OTHERS_LIMIT:
                 note.append(f"Measured under load: other processes used up to {most:.2f} cores.")
             if differ and each.places and method not in trivial:
                 note.append(f"Measured on {each.text}; not comparable with other machines or thread counts.")
@@ -206,12 +183,12 @@ def suspects(rows: Rows, methods: Sequence[str]) -> dict[tuple[str, str, str], s
     """The note for each metric, method and task with values that are marked as suspect in their rows."""
     notes = {}
     for method in methods:
-        own = rows.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
-        own = own[(own["status"] == "ok") & own["reason"].str.startswith(SUSPECT)]
-        for (metric, task), found in own.groupby(["metric", "task"]):
-            why = str(found["reason"].iloc[0]).removeprefix(SUSPECT)
+        values = rows.select(method=method, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+        values = values[(values["status"] == "ok") & values["reason"].str.startswith(SUSPECT)]
+        for (metric, task), frames in values.groupby(["metric", "task"]):
+            why = str(frames["reason"].iloc[0]).removeprefix(SUSPECT)
             notes[str(metric), method, str(task)] = (
-                f"Suspect, not ranked: {len(found)} frames are {why}, which a method that has not seen them cannot reach."
+                f"Suspect, not ranked: {len(frames)} frames are {why}, which a method that has not seen them cannot reach."
             )
     return notes
 
@@ -221,8 +198,8 @@ def mechanisms(rows: Rows, methods: Sequence[str]) -> tuple[dict[str, str], tupl
     notes, off = {}, []
     for method in methods:
         value = summarise(rows, method, DYNAMIC, "").value
-        own = rows.select(method=method, metric=DYNAMIC, task="", region=ALL, seeds=ALL)
-        reasons = list(filter(None, map(str, own["reason"])))
+        measured = rows.select(method=method, metric=DYNAMIC, task="", region=ALL, seeds=ALL)
+        reasons = list(filter(None, map(str, measured["reason"])))
         name, _, meaning = "".join(reasons[:1]).partition(": ")
         if value is None or not meaning:
             continue
@@ -287,13 +264,12 @@ def with_coded(manifest: Manifest, rows: Rows) -> tuple[Manifest, Rows]:
     if not labels:
         return manifest, rows
     records = [record for record in manifest.methods if record.label not in labels.values()]
-    more = [row for record in records if not record.condition for row in _coded_rows(rows, record, labels)]
-    kept = rows.of_methods([record.label for record in records])
+    coded = [row for record in records if not record.condition for row in _coded_rows(rows, record, labels)]
     metrics = list(manifest.metrics)
-    place = next((i + 1 for i, metric in enumerate(metrics) if metric.name == STORAGE), len(metrics))
-    metrics[place:place] = [STORAGE_CODED, CODED_CHANGE]
+    index = next((i + 1 for i, metric in enumerate(metrics) if metric.name == STORAGE), len(metrics))
+    metrics[index:index] = [STORAGE_CODED, CODED_CHANGE]
     manifest = replace(manifest, methods=tuple(records), metrics=tuple(metrics))
-    return manifest, Rows.joined([kept, Rows.of(more)])
+    return manifest, Rows.joined([rows.of_methods([r.label for r in records]), Rows.of(coded)])
 
 
 def coded_labels(manifest: Manifest) -> dict[str, str]:
@@ -307,22 +283,26 @@ def check_codecs(manifests: Sequence[Manifest], file: Path) -> None:
     """Refuse runs whose methods use different codecs.
 
     Plain methods must have files as trained, without a codec, and all coded ones the same codec with
-    the same steps. Runs that did not record codecs are accepted. Raises `InputError`, naming ``file``.
+    the same steps. Runs that did not record codecs are accepted.
     """
-    trained: dict[str, str] = {}
-    coded: dict[str, str] = {}
+    codecs: dict[str, dict[str, str]] = {"trained": {}, "coded": {}}
     for manifest in manifests:
         labels = coded_labels(manifest).values()
         for record in manifest.methods:
-            found = coded if record.label in labels else trained
-            if record.codec is not None and (found is coded or not record.condition):
-                found |= dict.fromkeys(record.codec.split("; "), record.label)
-    for kind, found, expected in (
-        ("trained", trained, "files as trained, without a codec"),
-        ("coded", coded, "one codec with one set of steps for all methods"),
+            kind = "coded" if record.label in labels else "trained"
+            if record.codec is not None and (kind == "coded" or not record.condition):
+                codecs[kind] |= dict.fromkeys(record.codec.split("; "), record.label)
+    for kind, refused, expected in (
+        ("trained", {*codecs["trained"]} - {""}, "files as trained, without a codec"),
+        (
+            "coded",
+            len(codecs["coded"]) > 1 or "" in codecs["coded"],
+            "one codec with one set of steps for all methods",
+        ),
     ):
-        if found and (set(found) != {""} if found is trained else len(found) > 1 or "" in found):
-            text = "; ".join(f"codec {codec or 'none'} ({label})" for codec, label in sorted(found.items()))
+        if refused:
+            pairs = sorted(codecs[kind].items())
+            text = "; ".join(f"codec {codec or 'none'} ({label})" for codec, label in pairs)
             remedy = "Sizes from different codecs are not comparable; code all avatars with one codec."
             raise InputError(file, f"methods, codec of {kind} avatars", expected, text, remedy)
 
@@ -330,34 +310,25 @@ def check_codecs(manifests: Sequence[Manifest], file: Path) -> None:
 def _coded_rows(rows: Rows, record: MethodRecord, labels: Mapping[str, str]) -> list[Row]:
     """Rows of both metrics of a plain method, by subject and seed."""
     coded, result = labels.get(record.name), []
-    for seed in sorted(rows.seeds(record.label)):
-        for subject in sorted(rows.subjects):
-            place = subject, seed
-            size = _mean_or_reason(rows, coded, STORAGE, "", *place)
-            changes = [
-                _change_by_coding(rows, record.label, coded, task, *place)
-                for task in TASKS
-                if task in rows.tasks
-            ]
-            # Missing ones first: the minimum over one task would hide that the other is unknown.
-            change = min(
-                changes, key=lambda each: (math.isfinite(each[0]), each[0]), default=(math.nan, NO_FRAMES)
-            )
-            for spec, (value, reason) in ((STORAGE_CODED, size), (CODED_CHANGE, change)):
-                row = Row(
-                    *(record.label, record.version, seed, "", subject, "", -1, "", FULL, spec.name),
-                    *(value, "", "ok" if math.isfinite(value) else "missing", reason),
+    for seed, subject in product(sorted(rows.seeds(record.label)), sorted(rows.subjects)):
+        changes = []
+        for task in TASKS:
+            if task in rows.tasks:
+                before, after = (
+                    _mean_or_reason(rows, label, QUALITY, task, subject, seed)
+                    for label in (record.label, coded)
                 )
-                result.append(row)
+                changes.append((after[0] - before[0], after[1] or before[1]))
+        # Missing ones first: the minimum over one task would hide that the other is unknown.
+        change = min(changes, key=lambda c: (math.isfinite(c[0]), c[0]), default=(math.nan, NO_FRAMES))
+        size = _mean_or_reason(rows, coded, STORAGE, "", subject, seed)
+        for spec, (value, reason) in ((STORAGE_CODED, size), (CODED_CHANGE, change)):
+            row = Row(
+                *(record.label, record.version, seed, "", subject, "", -1, "", FULL, spec.name),
+                *(value, "", "ok" if math.isfinite(value) else "missing", reason),
+            )
+            result.append(row)
     return result
-
-
-def _change_by_coding(
-    rows: Rows, label: str, coded: str | None, task: str, subject: str, seed: int
-) -> tuple[float, str]:
-    """Change of `QUALITY` in a task by the codec and "", or NaN and the reason."""
-    before, after = (_mean_or_reason(rows, of, QUALITY, task, subject, seed) for of in (label, coded))
-    return after[0] - before[0], after[1] or before[1]
 
 
 def _mean_or_reason(
@@ -366,12 +337,12 @@ def _mean_or_reason(
     """Mean of one metric of one avatar, over frames and sequences, and "", or NaN and the reason."""
     if label is None:
         return math.nan, "The method has no coded avatar."
-    own = rows.select(method=label, metric=metric, task=task, region=FULL, seeds=(seed,), subject=subject)
-    if own.empty:
+    values = rows.select(method=label, metric=metric, task=task, region=FULL, seeds=(seed,), subject=subject)
+    if values.empty:
         failed = rows.select(method=label, metric=ALL, task=ALL, region=ALL, seeds=(seed,), subject=subject)
         reasons = [str(reason) for reason in failed["reason"] if reason]
         return math.nan, reasons[0] if reasons else f"The run did not measure {metric} of the coded avatar."
-    missing = own[own["status"] != "ok"]
+    missing = values[values["status"] != "ok"]
     if len(missing):
         return math.nan, str(missing.iloc[0]["reason"])
-    return next(iter(subject_means(own).values())), ""
+    return next(iter(subject_means(values).values())), ""

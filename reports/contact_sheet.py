@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,9 +14,173 @@ import numpy as np
 from ..bench.contracts import ByteArray, FloatArray, FrameKey
 from ..bench.engine.store import FinishedRun
 from ..bench.errors import InputError
+from ..bench.io.documents import read_json
+from ..bench.io.images import read_png
 from ..bench.protocol import TASK_TITLES, evenly
+from ..bench.specs import CommandResult
 from .drawing import SheetSection, Tile, TileRow, colour_map, write_sheet
 from .runs import RunData
+
+RECORD_FILE, SHEET_FILE = "record.json", "contact_sheet.png"
+
+EXTRAPOLATED, BROKEN = "#e88714", "#cd142d"
+EXTREMES_WIDTH, REENACT_WIDTH, REENACT_COLUMNS = 110, 150, 8
+
+
+def robustness_report(folder: Path) -> CommandResult:
+    """Draw the contact sheet of ``headbench run extremes`` or ``headbench run reenact``; summarise it.
+
+    Does not pass if an avatar broke a limit or failed.
+    """
+    record = read_json(folder / RECORD_FILE)
+    avatars, failed = record["avatars"], record.get("failed", [])
+    rendered = [avatar for avatar in avatars if "missing" not in avatar]
+    text = table(avatars)
+    for each in failed:
+        text += f"\n{each['subject']} {each['method']} seed {each['seed']} failed: {each['reason']}"
+    if rendered:
+        write = write_extremes_sheet if "views" in rendered[0] else write_reenact_sheet
+        write(folder, rendered)
+        text += f"\n{folder / SHEET_FILE}"
+    passed = not failed and all(avatar["frames_broken"] == 0 for avatar in avatars)
+    return CommandResult(text, {"out": folder, "avatars": avatars}, passed)
+
+
+def write_extremes_sheet(
+    folder: Path, avatars: Sequence[Mapping[str, Any]], width: int = EXTREMES_WIDTH
+) -> None:
+    """Draw the sheet of avatars that ``headbench run extremes`` rendered into a folder: a column per view, then the path.
+
+    The ground truth, if available, is above each render. Views beyond the training cameras have an orange border, frames that
+    violate a limit a red one. The typical pose comes first, sampled poses below it.
+    """
+    write_sheet(
+        folder / SHEET_FILE,
+        [section for avatar in avatars for section in _extremes_sections(folder, avatar, width)],
+        title="Novel views and poses",
+        subtitle="Turntable between the training cameras and beyond; joint samples of expression and jaw along the principal "
+        "components of training; a path through two of them. Truth: the person of the synthetic capture, path-traced.",
+        marks={EXTRAPOLATED: "view beyond the training cameras", BROKEN: "a limit is exceeded"},
+        label_width=66,
+    )
+
+
+def write_reenact_sheet(
+    folder: Path,
+    rendered: Sequence[Mapping[str, Any]],
+    width: int = REENACT_WIDTH,
+    columns: int = REENACT_COLUMNS,
+) -> None:
+    """Draw the sheet of avatars that ``headbench run reenact`` rendered into a folder.
+
+    The source's frame is above the avatars that it drives, for up to ``columns`` evenly spaced timesteps of each pair of
+    target and source. Frames that violate a limit have a red border.
+    """
+
+    def pair(avatar: Mapping[str, Any]) -> tuple[str, str]:
+        return avatar["subject"], avatar["source"]
+
+    sections = []
+    for (target, source), group in groupby(sorted(rendered, key=pair), key=pair):
+        avatars = list(group)
+        chosen = evenly(range(len(avatars[0]["shown"])), columns)
+        first = [avatars[0]["shown"][i] for i in chosen]
+        places = [shown["key"].split("/") for shown in first]
+        rows = [TileRow(["source"], [Tile(_picture(folder / shown["source"], width)) for shown in first])]
+        for avatar in avatars:
+            broken = {item["key"] for item in avatar["broken"]}
+            tiles = [
+                Tile(_picture(folder / shown["driven"], width), mark=BROKEN if shown["key"] in broken else "")
+                for shown in (avatar["shown"][i] for i in chosen)
+            ]
+            rows.append(TileRow([avatar["method"], f"seed {avatar['seed']}"], tiles))
+        heads = [f"{sequence} {int(timestep)}" for _, _, sequence, timestep, _ in places]
+        sections.append(SheetSection(f"Subject {target} driven by {source}", heads, rows))
+    write_sheet(
+        folder / SHEET_FILE,
+        sections,
+        title="Cross-reenactment",
+        subtitle="Expressions of the source in the first row, avatars of another subject below; no ground truth.",
+        marks={BROKEN: "a limit is exceeded"},
+    )
+
+
+def _extremes_sections(folder: Path, avatar: Mapping[str, Any], width: int) -> list[SheetSection]:
+    """The turntable, whose columns are views, and the path, whose columns are time."""
+    views = {view["id"]: view for view in avatar["views"]}
+    broken = {item["key"] for item in avatar["broken"]}
+    columns: dict[str, list[Mapping[str, Any]]] = {name: [] for name in views}
+    path: list[Mapping[str, Any]] = []
+    for frame in avatar["shown"]:
+        _, sequence, _, camera = frame["key"].split("/")
+        (path if sequence == "path" else columns[camera]).append(frame)
+
+    def rows(frames: Sequence[Mapping[str, Any] | None], label: str) -> list[TileRow]:
+        """The ground truth of some frames, if available, with their renders below; None leaves a gap."""
+        made = []
+        for name, shown in (("truth", "truth"), ("render", "driven")):
+            if all(frame is None or shown in frame for frame in frames):
+                tiles = [Tile("") if frame is None else tile(frame, shown) for frame in frames]
+                made.append(TileRow([label, name], tiles))
+        return made
+
+    def tile(frame: Mapping[str, Any], shown: str) -> Tile:
+        _, sequence, _, camera = frame["key"].split("/")
+        mark = BROKEN if shown == "driven" and frame["key"] in broken else ""
+        mark = mark or (EXTRAPOLATED if views[camera]["extrapolated"] else "")
+        return Tile(_picture(folder / frame[shown], width), sequence if shown == "driven" else "", mark)
+
+    made = []
+    for index in range(max(map(len, columns.values()))):
+        frames = [column[index] if index < len(column) else None for column in columns.values()]
+        made += rows(frames, "samples" if index else "typical")
+    title = f"{avatar['method']}, subject {avatar['subject']}, seed {avatar['seed']}"
+    found = f"{avatar['frames_broken']} of {avatar['frames']} frames exceed a limit"
+    sections = [
+        SheetSection(f"{title}: {found}", [f"{view['azimuth']:+.0f}°" for view in views.values()], made)
+    ]
+    lines = [path[start : start + len(views)] for start in range(0, len(path), len(views))]
+    if lines:
+        made = [row for line in lines for row in rows(line, "path")]
+        sections.append(SheetSection(f"{title}: path", [""] * len(views), made))
+    return sections
+
+
+def _picture(path: Path, width: int) -> Any:
+    """The image at a width, reduced by area; frames with non-finite values have no file."""
+    if not path.exists():
+        return "not finite"
+    image = read_png(path)
+    size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
+    method = cv2.INTER_CUBIC if width > image.shape[1] else cv2.INTER_AREA
+    return cv2.resize(image, size, interpolation=method)
+
+
+def table(avatars: Sequence[Mapping[str, Any]]) -> str:
+    """Mean and worst value and failed frames of every measure of each avatar, for a terminal."""
+    lines = []
+    form = "  {:<16} {:>10} {:>10} {:>7} {:>7}".format
+    for avatar in avatars:
+        title = f"{avatar['subject']} {avatar['method']} seed {avatar['seed']}"
+        lines.append(f"{title}: {avatar['frames_broken']} of {avatar['frames']} frames exceed a limit")
+        if "missing" in avatar:
+            lines.append(f"  missing: {avatar['missing']}")
+            continue
+        if "no_truth" in avatar:
+            lines.append(f"  not compared with the truth: {avatar['no_truth']}")
+        lines.append(form("measure", "mean", "worst", "failed", "frames"))
+        for name, found in avatar["measures"].items():
+            if found["frames"] or found["failed"]:
+                values = ("-" if found[key] is None else f"{found[key]:.3f}" for key in ("mean", "worst"))
+                lines.append(form(name.replace("_", " "), *values, found["failed"], found["frames"]))
+        if avatar.get("identity") is not None:
+            known = [f"{name} {value:.1f}" for name, value in avatar["identity"].items() if value is not None]
+            lines.append(f"  colour difference from the subject's recordings (CIEDE2000): {', '.join(known)}")
+        lines += [f"  {b['key']}: {'; '.join(b['limits'])}" for b in avatar["broken"][:5]]
+        if len(avatar["broken"]) > 5:
+            lines.append(f"  and {len(avatar['broken']) - 5} more; all are in {RECORD_FILE}")
+    return "\n".join(lines)
+
 
 FRAMES_PER_TASK = 3
 PANEL_WIDTH = 240

@@ -19,7 +19,10 @@ from ..bench.specs import MetricKind, MetricSpec
 if TYPE_CHECKING:
     from ..bench.manifest import MethodRecord
     from .runs import RunSet
-    from .tables import Table, TableCell
+    from .tables import Table
+from ..bench.io.documents import read_json
+from ..bench.registry import discover
+from ..bench.specs import MethodSpec
 
 FOLDER = Path(__file__).with_name("published")
 
@@ -199,18 +202,25 @@ def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
     shown that are a row of the table by their settings alone. Raises `InputError` if the runs have no task of the table.
     """
     from ..bench.protocol import TASK_TITLES
-    from .tables import TableRow, build_table
+    from .tables import TableCell, TableRow, build_table
 
-    metrics = _metrics(runs, printed)
+    metrics = _printed_metrics(runs, printed)
     asked = {key.rpartition("/")[0] for key in printed.keys} - {""}
     tasks = [task for task in TASKS if task in asked and task in runs.tasks]
     if asked and not tasks:
         raise InputError(runs.runs[0].folder.root, "tasks", " or ".join(sorted(asked)), ", ".join(runs.tasks))
-    names = {label: _name(runs.records[label], label, printed) for label in _measured(runs, printed)}
+    names = {label: _printed_name(runs.records[label], label, printed) for label in _measured(runs, printed)}
     name_of_table = f"{name}-{printed.number}"
     measured = build_table(runs.listing([*names]), metrics, tasks, name=name_of_table)
     measured = measured.mapped(lambda row: replace(row, method=names[row.method]))
-    rows = tuple(TableRow(row.name, "", True, _cells(row, measured)) for row in printed.rows)
+    rows = []
+    for row in printed.rows:
+        texts = [_column_text(column.name, row.values.get(column.name, "")) for column in measured.columns]
+        cells = (
+            TableCell("published", float(text), text) if text else TableCell("none", None, "")
+            for text in texts
+        )
+        rows.append(TableRow(row.name, "", True, tuple(cells)))
     title = f"Printed in {printed.table} of the paper (not comparable): {printed.data}"
     absent = [TASK_TITLES[task] for task in TASKS if task in asked and task not in tasks]
     missing = [f"{task} is printed, but not measured here." for task in absent]
@@ -220,7 +230,7 @@ def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
     )
     return replace(
         measured,
-        groups=(*measured.groups, (title, rows)),
+        groups=(*measured.groups, (title, tuple(rows))),
         missing=(*measured.missing, *missing),
         printed=said,
     )
@@ -237,7 +247,7 @@ def _measured(runs: RunSet, printed: PrintedTable) -> list[str]:
     return [label for label in runs.methods if label in chosen]
 
 
-def _metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
+def _printed_metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
     """The metrics of a published table with its decimals, even if the runs lack them."""
     known = {spec.name: spec for spec in runs.metrics}
     used = {key.rpartition("/")[2]: bool(key.rpartition("/")[0]) for key in printed.keys}
@@ -252,7 +262,7 @@ def _metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
     return found
 
 
-def _name(record: MethodRecord, label: str, printed: PrintedTable) -> str:
+def _printed_name(record: MethodRecord, label: str, printed: PrintedTable) -> str:
     for row in printed.rows:
         if row.method and row.is_of(record):
             condition = f" ({record.condition})" if record.condition else ""
@@ -260,17 +270,9 @@ def _name(record: MethodRecord, label: str, printed: PrintedTable) -> str:
     return label
 
 
-def _cells(row: PrintedRow, table: Table) -> tuple[TableCell, ...]:
-    from .tables import TableCell
-
-    texts = [_shown(column.name, row.values.get(column.name)) for column in table.columns]
-    none = TableCell("none", None, "")
-    return tuple(none if text is None else TableCell("published", float(text), text) for text in texts)
-
-
-def _shown(name: str, text: str | None) -> str | None:
+def _column_text(name: str, text: str) -> str:
     """A stored value in the unit of its column: training times are stored in seconds and shown in minutes."""
-    if text is None or name != "training_time":
+    if not text or name != "training_time":
         return text
     minutes = float(text) / 60
     return f"{minutes:.1f}" if minutes >= 1 else f"{minutes:.2g}"
@@ -302,6 +304,110 @@ def counts() -> dict[str, dict[str, int]]:
             "values": sum(len(row.values) for row in rows),
         }
     return found
+
+
+MEASURED = Path(__file__).with_name("measured.json")
+"""Written with the tables of the suite (``docs/_ext/stored_results.py``)."""
+
+
+@dataclass(frozen=True)
+class PrintedFigures:
+    """Published values of a method; ``own``: whether by the method's own paper. Values by "task/metric", as printed."""
+
+    paper: str
+    table: str
+    data: str
+    grade: str
+    own: bool
+    values: dict[str, str]
+
+
+def printed_figures(spec: MethodSpec) -> list[PrintedFigures]:
+    """Rows of a method in all stored tables of grades A and B, those of its own paper first, without ablations."""
+    numbers = {*re.findall(r"\d{4}\.\d{4,5}", spec.source)}
+    found = []
+    for name, paper in papers().items():
+        for table in paper.tables:
+            if table.grade not in COMPARABLE or "ablation" in table.table:
+                continue
+            for row in table.rows:
+                if row.method == spec.name:
+                    own = paper.arxiv in numbers
+                    found.append(PrintedFigures(name, table.table, table.data, table.grade, own, row.values))
+    return sorted(found, key=lambda figures: not figures.own)
+
+
+@dataclass(frozen=True)
+class MeasuredFigures:
+    """Values of a method measured in the suite, by "task/metric", as displayed."""
+
+    suite: str
+    data: str
+    values: dict[str, str]
+
+
+def measured_figures(name: str) -> MeasuredFigures | None:
+    """Values of the named method; None if it is not in the suite."""
+    if not MEASURED.is_file():
+        return None
+    stored = read_json(MEASURED)
+    values = stored["methods"].get(name)
+    return None if values is None else MeasuredFigures(stored["suite"], stored["data"], values)
+
+
+def citations() -> list[dict[str, Any]]:
+    """A card for every registered method, for ``headbench list methods --cite``: ``summary`` has its text."""
+    cards = []
+    for name, plugin in discover("methods").items():
+        spec = plugin.spec
+        if not isinstance(spec, MethodSpec) or not spec.source:
+            continue
+        figures = printed_figures(spec)
+        lines = [spec.summary, f"Source: {spec.source}"]
+        code = (
+            "of headbench, written from the paper"
+            if spec.native
+            else "of the authors, in a checkout of yours"
+        )
+        lines.append(f"Code: {code}")
+        lines += [f"Printed: {figure_text(figure)}" for figure in figures]
+        measured = measured_figures(name)
+        lines += [f"Measured: {measured_text(measured)}"] if measured else []
+        lines += [spec.bibtex.strip()] if spec.bibtex else []
+        text = "\n".join(lines).replace("\n", "\n  ")
+        cards.append(
+            {
+                "name": name,
+                "error": "",
+                "summary": f"{text}\n",
+                "source": spec.source,
+                "bibtex": spec.bibtex.strip(),
+                "native": spec.native,
+                "printed": [vars(figure) for figure in figures],
+                "measured": vars(measured) if measured else None,
+            }
+        )
+    return cards
+
+
+SHOWN = {"novel_view/psnr": "novel view", "self_reenactment/psnr": "self-reenactment", "fps": "speed"}
+UNITS = {"fps": "FPS"}
+
+
+def figure_text(figures: PrintedFigures) -> str:
+    """PSNR and speed of a published row as text, with the source."""
+    by = "claimed" if figures.own else "run by others"
+    return f"{_psnr_and_speed(figures.values)} ({by}: {figures.paper}, {figures.table}, {figures.data}, grade {figures.grade})"
+
+
+def measured_text(figures: MeasuredFigures) -> str:
+    """PSNR and speed in the suite as text."""
+    return f"{_psnr_and_speed(figures.values)} (by headbench, {figures.suite}: {figures.data})"
+
+
+def _psnr_and_speed(values: dict[str, str]) -> str:
+    shown = [f"{label} {values[key]} {UNITS.get(key, 'dB')}" for key, label in SHOWN.items() if key in values]
+    return ", ".join(shown) or "other metrics"
 
 
 if __name__ == "__main__":  # for `make check`

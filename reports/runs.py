@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from itertools import product
+from itertools import chain, combinations, product
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Self
@@ -105,11 +105,11 @@ class RunData:
 
     def reason(self, method: str, task: str, key: FrameKey) -> str:
         """Reason why a method has no render of a frame, if recorded in the rows."""
-        seeds = (self.seed,)
-        own = self.rows.select(
-            method=method, metric=ALL, task=task, region=FULL, seeds=seeds, subject=key.subject
+        seeds, subject = (self.seed,), key.subject
+        rows = self.rows.select(
+            method=method, metric=ALL, task=task, region=FULL, seeds=seeds, subject=subject
         )
-        failed = own[own["status"] == "failed"]
+        failed = rows[rows["status"] == "failed"]
         return "not rendered" if failed.empty else str(failed.iloc[0]["reason"])
 
     def value(self, metric: str, method: str, task: str, key: FrameKey) -> float | None:
@@ -126,9 +126,9 @@ class RunData:
     @cached_property
     def _by_frame(self) -> dict[tuple[Any, ...], float]:
         rows = self.rows.select(method=ALL, metric=ALL, task=ALL, region=FULL, seeds=(self.seed,))
-        shown = rows[(rows["status"] == "ok") & (rows["timestep"] >= 0)]
-        places = shown[["metric", "method", "task", *FrameKey._fields]].itertuples(index=False, name=None)
-        return dict(zip(places, shown["value"].astype(float)))
+        rows = rows[(rows["status"] == "ok") & (rows["timestep"] >= 0)]
+        places = rows[["metric", "method", "task", *FrameKey._fields]].itertuples(index=False, name=None)
+        return dict(zip(places, rows["value"].astype(float)))
 
     @cached_property
     def _clips(self) -> Mapping[str, Clip]:
@@ -158,10 +158,9 @@ class FrameSelection:
     @property
     def text(self) -> str:
         """Description; "" for whole frames of all sequences."""
-        region = "" if self.region == FULL else f"Region: {self.region}."
-        return " ".join(
-            filter(None, [region, f"Sequences: {', '.join(self.sequences)}." if self.sequences else ""])
-        )
+        sentences = [f"Region: {self.region}."] if self.region != FULL else []
+        sentences += [f"Sequences: {', '.join(self.sequences)}."] if self.sequences else []
+        return " ".join(sentences)
 
 
 WHOLE = FrameSelection()
@@ -169,43 +168,30 @@ WHOLE = FrameSelection()
 
 @dataclass(frozen=True)
 class RunSet:
-    """Runs on the same frames, in the order given. The methods in their ``rows`` are named by labels.
-
-    ``part`` describes the part of the frames in the rows, "" for all. ``cameras`` is a sentence on seen and unseen cameras,
-    "" before `by_camera`. ``records`` has the method's entry of
-    the manifest by label; ``trivial`` has labels of trivial baselines. ``keys`` has the frames of each task
-    in the protocol, including those without values. ``shown`` has, by label, the first run of the method and
-    its name there, whose renders are shown. ``protocol`` is the name of the protocol by which rows were chosen, see
-    `protocols.under`, "" for none, ``averaged`` says over what its values are means.
-    """
+    """Runs on the same frames, in the order given. The methods in their ``rows`` are named by labels."""
 
     runs: tuple[RunData, ...]
     rows: Rows
     metrics: tuple[MetricSpec, ...]
     tasks: tuple[str, ...]
-    records: Mapping[str, MethodRecord]
-    trivial: tuple[str, ...]
-    keys: Mapping[str, frozenset[FrameKey]]
-    shown: Mapping[str, tuple[RunData, str]]
-    part: str = ""
-    cameras: str = ""
-    protocol: str = ""
-    averaged: str = AVERAGED
+    records: Mapping[str, MethodRecord]  # entries of the manifests, by label
+    trivial: tuple[str, ...]  # labels of trivial baselines
+    keys: Mapping[str, frozenset[FrameKey]]  # frames of each task in the protocol, also those without values
+    pictured: Mapping[
+        str, tuple[RunData, str]
+    ]  # by label, the run whose renders are shown, and the name there
+    part: str = ""  # description of the part of the frames, "" for all
+    cameras: str = ""  # sentence on seen and unseen cameras, "" before `by_camera`
+    protocol: str = ""  # by which rows were chosen, see `protocols.under`
+    averaged: str = AVERAGED  # over what values are means
 
     @classmethod
     def read(cls, folders: Sequence[Path | FinishedRun], part: FrameSelection = WHOLE) -> RunSet:
         """Read runs, or a part of their frames.
 
         Runs of other subjects are joined: their protocols may differ in clips alone. Seeds and subjects of the same method
-        with the same settings are merged. A method with other
-        settings is a separate one, named after the settings that differ ("ours (dynamic=opacity)"), or after
-        the folders if that is too long.
-
-        Raises
-        ------
-        InputError
-            Runs score different frames or protocols, define a metric differently, or contain the
-            same training twice; rows are invalid; or a region or a sequence is missing.
+        with the same settings are merged. A method with other settings is a separate one, named after the settings that
+        differ ("ours (dynamic=opacity)"), or after the folders if that is too long.
         """
         if not folders:
             raise InputError("runs", "", "at least one folder", "none")
@@ -221,30 +207,32 @@ class RunSet:
         labels = training_labels(runs)
         if runs:
             check_codecs([run.manifest for run in runs], runs[0].folder.manifest)
-        changed = [with_coded(run.manifest, run.rows) for run in runs]
-        runs = tuple(replace(run, manifest=m, rows=rows) for run, (m, rows) in zip(runs, changed))
-        rows = Rows.joined([run.rows.renamed(own) for run, own in zip(runs, labels)])
+        coded = [with_coded(run.manifest, run.rows) for run in runs]
+        runs = tuple(replace(run, manifest=m, rows=rows) for run, (m, rows) in zip(runs, coded))
+        rows = Rows.joined([run.rows.renamed(names) for run, names in zip(runs, labels)])
         rows.check()
-        records = {
-            own[method.label]: method for run, own in zip(runs, labels) for method in run.manifest.methods
-        }
+        trained = [(run, names[m.label], m) for run, names in zip(runs, labels) for m in run.manifest.methods]
+        records = {label: record for _, label, record in trained}
         tasks = tuple(dict.fromkeys(task for run in runs for task in run.tasks))
         trivial = tuple(label for label, record in records.items() if record.trivial)
         keys = {task: frozenset(key for run in runs for key in run.keys(task)) for task in tasks}
-        shown: dict[str, tuple[RunData, str]] = {}
-        for run, own in zip(runs, labels):
-            for method in run.methods:
-                shown.setdefault(own[method], (run, method))
-        return cls(runs, rows, _metrics(runs), tasks, records, trivial, keys, shown)
+        pictured: dict[str, tuple[RunData, str]] = {}
+        for run, label, record in trained:
+            pictured.setdefault(label, (run, record.label))
+        return cls(runs, rows, _metrics(runs), tasks, records, trivial, keys, pictured)
 
     def of(self, part: FrameSelection) -> RunSet:
-        """Select a part of the frames of completely loaded runs.
-
-        Raises `InputError` for a region or a sequence that they do not have.
-        """
+        """Select a part of the frames of completely loaded runs."""
         if part == WHOLE:
             return self
-        rows = _of_part(self.rows, part, self.runs[0].folder.rows)
+        rows, file = self.rows, self.runs[0].folder.rows
+        for key, names, valid in (
+            ("region", {part.region}, rows.regions),
+            ("sequences", {*part.sequences}, rows.sequences),
+        ):
+            if unknown := names - valid:
+                raise InputError(file, key, f"one of {', '.join(sorted(valid))}", ", ".join(sorted(unknown)))
+        rows = rows.of_part(part.region, part.sequences, FULL)
         tasks = tuple(task for task in self.tasks if task in rows.tasks)
         metrics = tuple(spec for spec in self.metrics if spec.name in rows.metrics)
         chosen = {
@@ -264,25 +252,25 @@ class RunSet:
             return replace(self, cameras=reason)
         inside = frozenset(key for key in keys if (key.subject, key.camera) in unseen)
         parts = {SEEN_CAMERAS: keys - inside, UNSEEN_CAMERAS: inside}
-        place = self.tasks.index(SPLIT_TASK)
+        index = self.tasks.index(SPLIT_TASK)
         return replace(
             self,
             rows=self.rows.split_by_camera(SPLIT_TASK, unseen, UNSEEN_CAMERAS, SEEN_CAMERAS),
-            tasks=(*self.tasks[:place], *parts, *self.tasks[place + 1 :]),
-            keys={task: own for task, own in self.keys.items() if task != SPLIT_TASK} | parts,
+            tasks=(*self.tasks[:index], *parts, *self.tasks[index + 1 :]),
+            keys={task: frames for task, frames in self.keys.items() if task != SPLIT_TASK} | parts,
             cameras=explained(keys, unseen),
         )
 
     @property
     def shared(self) -> Self:
         """Restrict the runs to subjects for which every label has rows."""
-        cells = self.rows.subjects_of(self.methods)
-        kept = frozenset.intersection(*cells.values()) if cells else frozenset()
-        expected = {key.subject for own in self.keys.values() for key in own}
-        if all(found == kept for found in (*cells.values(), expected)):
+        by_label = self.rows.subjects_of(self.methods)
+        common = frozenset.intersection(*by_label.values()) if by_label else frozenset()
+        scored = {key.subject for keys in self.keys.values() for key in keys}
+        if all(subjects == common for subjects in (*by_label.values(), scored)):
             return self
-        keys = {task: frozenset(k for k in own if k.subject in kept) for task, own in self.keys.items()}
-        return replace(self, rows=self.rows.of_subjects(kept), keys=keys)
+        keys = {task: frozenset(k for k in keys if k.subject in common) for task, keys in self.keys.items()}
+        return replace(self, rows=self.rows.of_subjects(common), keys=keys)
 
     @property
     def without_conditions(self) -> Self:
@@ -314,8 +302,8 @@ class RunSet:
     @property
     def changed(self) -> tuple[str, ...]:
         """Labels of methods under a condition; empty if all methods are, as in a curve."""
-        changed = tuple(label for label, record in self.records.items() if record.condition)
-        return changed if {*changed, *self.trivial} < {*self.records} else ()
+        labels = tuple(label for label, record in self.records.items() if record.condition)
+        return labels if {*labels, *self.trivial} < {*self.records} else ()
 
     @property
     def protocol_ids(self) -> dict[str, str]:
@@ -326,15 +314,15 @@ class RunSet:
     @property
     def with_refit(self) -> tuple[str, ...]:
         """Labels under conditions that score frames from other views than those of the capture's tracking."""
-        changed = {c.name for run in self.runs for c in run.manifest.configuration.conditions if c.views}
-        return tuple(label for label, record in self.records.items() if record.condition in changed)
+        names = {c.name for run in self.runs for c in run.manifest.configuration.conditions if c.views}
+        return tuple(label for label, record in self.records.items() if record.condition in names)
 
     @property
     def missing(self) -> tuple[str, ...]:
         """A sentence for each requested task that no run could measure."""
-        done = {task for run in self.runs for task in run.tasks}
-        asked = dict.fromkeys(task for run in self.runs for task in run.manifest.configuration.tasks)
-        return tuple(missing_tasks([*asked], done).values())
+        measured = {task for run in self.runs for task in run.tasks}
+        requested = dict.fromkeys(task for run in self.runs for task in run.manifest.configuration.tasks)
+        return tuple(missing_tasks([*requested], measured).values())
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -395,57 +383,41 @@ def unseen_cameras(
     """The (subject, camera) pairs of self-reenactment without training frames; none and a reason, one sentence, if
     they are all, none, or not the same in all runs.
     """
-    unseen = set()
+    unseen, why = set(), ""
     cameras = {(key.subject, key.camera) for key in keys}
     for subject in {key.subject for key in keys}:
         clips = (clip for manifest in manifests for clip in manifest.clips if clip.subject == subject)
-        own = {camera for name, camera in cameras if name == subject}
-        seen = {frozenset(own & {*clip.training_cameras}) for clip in clips}
+        scored = {camera for name, camera in cameras if name == subject}
+        seen = {frozenset(scored & {*clip.training_cameras}) for clip in clips}
         if len(seen) != 1:
-            return frozenset(), _one_column("the runs differ in which cameras were trained on")
-        unseen |= {(subject, camera) for camera in own.difference(*seen)}
-    if not unseen:
-        return frozenset(), _one_column("methods are trained on all of its cameras") if keys else ""
-    if len(unseen) == len(cameras):
-        return frozenset(), _one_column("methods are trained on none of its cameras")
-    return frozenset(unseen), ""
-
-
-def _one_column(why: str) -> str:
-    return f"Self-reenactment is not split into seen and unseen cameras: {why}."
-
-
-def _of_part(rows: Rows, part: FrameSelection, file: Path) -> Rows:
-    asked = (("region", {part.region}, rows.regions), ("sequences", {*part.sequences}, rows.sequences))
-    for key, names, known in asked:
-        if names - known:
-            expected, found = f"one of {', '.join(sorted(known))}", ", ".join(sorted(names - known))
-            raise InputError(file, key, expected, found)
-    return rows.of_part(part.region, part.sequences, FULL)
+            why = "the runs differ in which cameras were trained on"
+            break
+        unseen |= {(subject, camera) for camera in scored.difference(*seen)}
+    else:
+        if len(unseen) in (0, len(cameras)):
+            why = f"methods are trained on {'none' if unseen else 'all'} of its cameras" if keys else ""
+        else:
+            return frozenset(unseen), ""
+    return frozenset(), f"Self-reenactment is not split into seen and unseen cameras: {why}." if why else ""
 
 
 def _with_one_protocol(runs: tuple[RunData, ...]) -> tuple[RunData, ...]:
     """The runs, with rows under the joint protocol of all subjects; see `joined_protocol`."""
-    whole: dict[str, str] = {}
+    joined: dict[str, str] = {}
     for task in dict.fromkeys(task for run in runs for task in run.tasks):
-        own = [run for run in runs if task in run.tasks]
-        if len({run.manifest.protocols[task].hash for run in own}) == 1:
+        scored = [run for run in runs if task in run.tasks]
+        if len({run.manifest.protocols[task].hash for run in scored}) == 1:
             continue
-        for index, run in enumerate(own):
-            for earlier in own[:index]:
-                if {*_subjects(run, task)} & {*_subjects(earlier, task)}:
-                    check_same_protocol(earlier, run, task)
-        protocols = [run.manifest.protocols[task].protocol(run.folder.manifest) for run in own]
-        joined = joined_protocol(protocols).hash
-        whole |= {protocol.hash: joined for protocol in protocols}
-    return tuple(replace(run, rows=run.rows.of_protocols(whole)) for run in runs) if whole else runs
+        for earlier, run in combinations(scored, 2):
+            if not {*_subjects(run, task)}.isdisjoint(_subjects(earlier, task)):
+                check_same_protocol(earlier, run, task)
+        protocols = [run.manifest.protocols[task].protocol(run.folder.manifest) for run in scored]
+        joined |= dict.fromkeys((protocol.hash for protocol in protocols), joined_protocol(protocols).hash)
+    return tuple(replace(run, rows=run.rows.of_protocols(joined)) for run in runs) if joined else runs
 
 
 def joined_subjects(runs: Sequence[RunData]) -> list[RunData]:
-    """Join runs of different subjects into one, returned in a list; the runs are unchanged if two share a subject.
-
-    Raises `InputError` for runs of different subjects with different methods, settings, metrics or kinds of protocol.
-    """
+    """Join runs of different subjects into one, returned in a list; the runs are unchanged if two share a subject."""
     subjects = [subject for run in runs for subject in run.rows.subjects]
     if len(runs) < 2 or len(set(subjects)) < len(subjects):
         return list(runs)
@@ -466,16 +438,16 @@ def _subjects(run: RunData, task: str) -> list[str]:
 
 def check_same_protocol(first: RunData, run: RunData, task: str) -> None:
     """Raise `InputError` if two runs score different frames of a task or use different protocols."""
-    one, other = (own.manifest.protocols[task] for own in (first, run))
+    one, other = first.manifest.protocols[task], run.manifest.protocols[task]
     if one.hash != other.hash:
-        known = f"protocol {one.hash}, that of {first.folder.root}"
+        expected = f"protocol {one.hash}, that of {first.folder.root}"
         remedy = "Score the same frames."
         if one.design == other.design:
             remedy = (
                 "The frames are the same, but the files of the captures differ in content (images, masks, parameters, "
                 "cameras, head model), or the settings of their reader: use one capture for both runs."
             )
-        raise InputError(run.folder.root, f"protocol of {task}", known, other.hash, remedy)
+        raise InputError(run.folder.root, f"protocol of {task}", expected, other.hash, remedy)
 
 
 def _metrics(runs: Sequence[RunData]) -> tuple[MetricSpec, ...]:
@@ -485,8 +457,8 @@ def _metrics(runs: Sequence[RunData]) -> tuple[MetricSpec, ...]:
     for run in runs:
         for spec in run.metrics:
             if meaning(metrics.setdefault(spec.name, spec)) != meaning(spec):
-                known = f"{spec.name} as in {runs[0].folder.root}"
-                raise InputError(run.folder.manifest, "metrics", known, "another definition")
+                expected = f"{spec.name} as in {runs[0].folder.root}"
+                raise InputError(run.folder.manifest, "metrics", expected, "another definition")
     return tuple(metrics.values())
 
 
@@ -511,17 +483,17 @@ def training_labels(runs: Sequence[RunData]) -> list[dict[str, str]]:
     for index, run in enumerate(runs):
         for record in run.manifest.methods:
             cells = {*product(sorted(run.rows.subjects), run.rows.seeds(record.label))}
-            known = trainings.setdefault(record.label, [])
-            same = next((t for t in known if _same_training(t.record, record) and not t.cells & cells), None)
-            if same is None:
-                known.append(_Training(record, [index], cells))
+            of_label = trainings.setdefault(record.label, [])
+            same = (t for t in of_label if _same_training(t.record, record) and not t.cells & cells)
+            if training := next(same, None):
+                training.runs.append(index)
+                training.cells |= cells
             else:
-                same.runs.append(index)
-                same.cells |= cells
+                of_label.append(_Training(record, [index], cells))
     labels: list[dict[str, str]] = [{} for _ in runs]
-    for name, known in trainings.items():
-        folders = [runs[training.runs[0]].folder.root for training in known]
-        for training, label in zip(known, _names(name, [t.record for t in known], folders)):
+    for name, of_label in trainings.items():
+        folders = [runs[training.runs[0]].folder.root for training in of_label]
+        for training, label in zip(of_label, _names(name, [t.record for t in of_label], folders)):
             for index in training.runs:
                 labels[index][name] = label
     return labels
@@ -532,7 +504,7 @@ def _names(name: str, records: Sequence[MethodRecord], folders: Sequence[Path]) 
     if len(records) == 1:
         return [name]
     flat = [_flat(asdict(record)) for record in records]
-    keys = [k for k in dict.fromkeys(k for f in flat for k in f) if len({f.get(k, "") for f in flat}) > 1]
+    keys = [k for k in dict.fromkeys(chain(*flat)) if len({f.get(k, "") for f in flat}) > 1]
     settings = [", ".join(f"{key.rpartition('.')[2]}={f.get(key, 'none')}" for key in keys) for f in flat]
     choices = [[folder.name for folder in folders], [folder.as_posix() for folder in folders]]
     if max(map(len, settings)) <= LONGEST_DIFFERENCE:
@@ -546,7 +518,5 @@ def _names(name: str, records: Sequence[MethodRecord], folders: Sequence[Path]) 
 def _flat(value: Any, prefix: str = "") -> dict[str, str]:
     """Settings by dotted key, as text."""
     if isinstance(value, Mapping):
-        return {
-            key: text for name, part in value.items() for key, text in _flat(part, f"{prefix}.{name}").items()
-        }
+        return dict(chain(*(_flat(entry, f"{prefix}.{name}").items() for name, entry in value.items())))
     return {prefix: "+".join(map(str, value)) if isinstance(value, list) else str(value)}

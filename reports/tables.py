@@ -65,14 +65,15 @@ class TableCell:
 
     ``status`` is "ok", "missing" (could not be or was not measured),
     "failed" (the method raised an error), "published" (printed in a paper, not measured) or "none" (not printed there).
-    ``rank`` is 1 for all methods that may be the best, then 2, 3, ... for the next displayed values; None if unranked.
     """
 
     status: Literal["ok", "missing", "failed", "published", "none"]
     value: float | None  # full precision; None unless ok or published
     text: str  # as displayed
     spread: str = ""  # standard deviation over seeds, as displayed; "" with one seed
-    rank: int | None = None
+    rank: int | None = (
+        None  # 1 for all that may be the best, then 2, 3, ... by displayed value; None if unranked
+    )
     note: int | None = None  # index into `Table.notes`
 
     @property
@@ -110,32 +111,25 @@ class TaskSummary:
 
 @dataclass(frozen=True)
 class Table:
-    """A comparison that can be written in any format.
-
-    ``warnings`` name methods that are not better than a trivial baseline, or whose mechanism is off; ``marking`` explains the ranks and their test (``tested``: whether there is one), ``starred`` those of text, which marks
-    only the best; ``part`` describes the part of the
-    frames, "" for all; ``missing`` explains why a task has no columns; ``name`` is the layout; ``cameras`` describes seen and
-    unseen cameras, or why they are not shown separately; ``printed`` is the source of published values, with their conditions
-    in further sentences; ``averaged`` describes the averaging.
-    """
+    """A comparison that can be written in any format."""
 
     columns: tuple[Column, ...]
     groups: tuple[tuple[str, tuple[TableRow, ...]], ...]  # (title, rows); empty groups are left out
     notes: tuple[str, ...]
     tasks: tuple[TaskSummary, ...]
     seeds: int
-    warnings: tuple[str, ...] = ()
-    marking: str = ""
-    starred: str = ""
+    warnings: tuple[str, ...] = ()  # methods not better than a trivial baseline, or whose mechanism is off
+    marking: str = ""  # explains the ranks and their test
+    starred: str = ""  # the same for text, which marks only the best
     image_size: str = ""
     cut: str = ""
     machine: str = ""
-    part: str = ""
-    missing: tuple[str, ...] = ()
-    name: str = ""
-    tested: bool = False
-    cameras: str = ""
-    printed: tuple[str, ...] = ()
+    part: str = ""  # of the frames, "" for all
+    missing: tuple[str, ...] = ()  # why tasks have no columns
+    name: str = ""  # the layout
+    tested: bool = False  # whether ranks are by a test
+    cameras: str = ""  # seen and unseen cameras, or why they are not shown separately
+    printed: tuple[str, ...] = ()  # source of published values, then their conditions
     averaged: str = AVERAGED
 
     @property
@@ -218,6 +212,8 @@ class Table:
         return any(column.metric == "fps" for column in self.columns)
 
 
+COMPARISON = "comparison"
+"""Name of the layout that every run has."""
 AVATAR_TITLE = "Avatar"
 TITLES = {"speed": "Speed", "cost": "Storage and training", "mechanism": "Mechanisms"}
 """Titles of layouts whose columns belong to no task."""
@@ -250,45 +246,40 @@ def build_table(
     and methods under conditions (`RunSet.changed`) are listed separately and not ranked.
 
     ``metrics`` are the columns, in order; metrics of frames appear once in each of ``tasks``, the others last, below
-    ``avatar_title``. ``missing`` are sentences for the caption, ``name`` is the layout. Raises `InputError` for rows that mix
-    protocols in a task.
+    ``avatar_title``. ``missing`` are sentences for the caption, ``name`` is the layout.
     """
-    rows, methods, trivial, changed = runs.rows, runs.methods, runs.trivial, runs.changed
+    rows, methods, trivial = runs.rows, runs.methods, runs.trivial
     rows.check_protocols("rows")
-    places = [
-        (spec, task, TASK_TITLES.get(task, task)) for task in tasks for spec in metrics if spec.per_frame
-    ]
-    places += [(spec, "", avatar_title) for spec in metrics if not spec.per_frame]
+    places = [(m, task, TASK_TITLES.get(task, task)) for task in tasks for m in metrics if m.per_frame]
+    places += [(m, "", avatar_title) for m in metrics if not m.per_frame]
     columns = tuple(
         Column(task, title, m.name, m.label, m.unit, m.digits, m.higher_is_better)
         for m, task, title in places
     )
-    found = conditions(rows, metrics, methods)
-    told, off = mechanisms(rows, methods)
-    marked = marks(found, trivial)
-    mechanical = {spec.name for spec in metrics if spec.kind == "mechanism"}
-    suspect = suspects(rows, methods)
-    too_good = {method for _, method, _ in suspect}
-    titles = dict.fromkeys(methods, METHODS_TITLE)
+    measured = conditions(rows, metrics, methods)
+    mechanism_notes, off = mechanisms(rows, methods)
+    time_notes = marks(measured, trivial)
+    suspect_notes = suspects(rows, methods)
     below = not_better(rows, metrics, methods, trivial, tasks)
-    for title, own in (
-        *((BELOW_TITLE, below), (SUSPECT_TITLE, too_good)),
-        *((TRIVIAL_TITLE, trivial), (CONDITIONS_TITLE, changed)),
+    titles = dict.fromkeys(methods, METHODS_TITLE)
+    for title, names in (
+        *((BELOW_TITLE, below), (SUSPECT_TITLE, {method for _, method, _ in suspect_notes})),
+        *((TRIVIAL_TITLE, trivial), (CONDITIONS_TITLE, runs.changed)),
     ):
-        titles |= {method: title for method in methods if method in own}
+        titles |= {method: title for method in methods if method in names}
     unranked = {method for method, title in titles.items() if title != METHODS_TITLE}
     notes: list[str] = []
     lines: list[TableRow] = []
     for method in methods:
         cells = []
         for c in columns:
-            cell = summarise(rows, method, c.metric, c.task)
-            mark = suspect.get((c.metric, method, c.task)) or marked.get((c.metric, method), "")
-            mark = told.get(method, "") if c.metric == DYNAMIC else mark
-            cells.append(_cell(cell, c.digits, notes, mark))
+            note = suspect_notes.get((c.metric, method, c.task)) or time_notes.get((c.metric, method), "")
+            note = mechanism_notes.get(method, "") if c.metric == DYNAMIC else note
+            cells.append(_cell(summarise(rows, method, c.metric, c.task), c.digits, notes, note))
         lines.append(TableRow(method, ", ".join(rows.versions(method)), method in unranked, tuple(cells)))
     # Times measured under different conditions are not ranked, and mechanisms are different quantities.
-    unequal = {metric for metric, method in marked if method not in unranked} | mechanical
+    unequal = {metric for metric, method in time_notes if method not in unranked}
+    unequal |= {spec.name for spec in metrics if spec.kind == "mechanism"}
     bests = [
         None if column.metric in unequal else _best(rows, lines, index, column)
         for index, column in enumerate(columns)
@@ -313,7 +304,7 @@ def build_table(
         starred=starred,
         image_size=runs.image_size,
         cut=runs.cut,
-        machine=measured_on(found.get("fps", {}), trivial, runs.machine),
+        machine=measured_on(measured.get("fps", {}), trivial, runs.machine),
         part=runs.part,
         missing=tuple(missing),
         cameras=runs.cameras,
@@ -331,33 +322,25 @@ def not_better(
     tasks: Sequence[str],
 ) -> dict[str, str]:
     """Sentences by method on those that are not better than a trivial baseline in some task."""
-    found: dict[str, str] = {}
-    plain = [
-        name for name in trivial if CONDITION_MARK not in name
-    ] or trivial  # conditions change the task, too
-    of_frames = sorted((spec for spec in metrics if spec.per_frame), key=lambda spec: spec.name != DECIDING)
-    for spec in of_frames[:1]:
-        sign = 1 if spec.higher_is_better else -1
-        for task in tasks:
-            values = {name: summarise(rows, name, spec.name, task).value for name in (*methods, *trivial)}
-            floors = {name: sign * value for name in plain if (value := values[name]) is not None}
-            best = max(floors, key=floors.__getitem__, default="")
-            for name in methods:
-                value = values[name]
-                if (
-                    name in trivial
-                    or name in found
-                    or not best
-                    or value is None
-                    or sign * value > floors[best]
-                ):
-                    continue
-                amounts = (
-                    f"{value:.{spec.digits}f} against {values[best]:.{spec.digits}f} {spec.unit}".rstrip()
-                )
-                where = TASK_TITLES.get(task, task).lower()
-                found[name] = f"{name} is not better than {best} in {where}: {spec.label} {amounts}."
-    return found
+    sentences: dict[str, str] = {}
+    # Conditions change the task, too.
+    plain = [name for name in trivial if CONDITION_MARK not in name] or trivial
+    spec = min((m for m in metrics if m.per_frame), key=lambda m: m.name != DECIDING, default=None)
+    if spec is None:
+        return {}
+    sign = 1 if spec.higher_is_better else -1
+    for task in tasks:
+        values = {name: summarise(rows, name, spec.name, task).value for name in (*methods, *trivial)}
+        floors = {name: sign * value for name in plain if (value := values[name]) is not None}
+        best = max(floors, key=floors.__getitem__, default="")
+        for name in methods if best else ():
+            value = values[name]
+            if name in (*trivial, *sentences) or value is None or sign * value > floors[best]:
+                continue
+            amounts = f"{value:.{spec.digits}f} against {values[best]:.{spec.digits}f} {spec.unit}".rstrip()
+            where = TASK_TITLES.get(task, task).lower()
+            sentences[name] = f"{name} is not better than {best} in {where}: {spec.label} {amounts}."
+    return sentences
 
 
 def _task_summary(rows: Rows, task: str, protocol_id: str, keys: Collection[FrameKey]) -> TaskSummary:
@@ -369,9 +352,9 @@ def _task_summary(rows: Rows, task: str, protocol_id: str, keys: Collection[Fram
     return TaskSummary(task, title, protocol_id, "".join(rows.protocols(task)), len(frames), len(subjects))
 
 
-def _cell(aggregate: Aggregate, digits: int, notes: list[str], mark: str) -> TableCell:
-    """A cell; ``mark`` is the note for its value, "" for none."""
-    text = f"{aggregate.reason} {mark}".strip() if aggregate.value is not None else aggregate.reason
+def _cell(aggregate: Aggregate, digits: int, notes: list[str], of_value: str) -> TableCell:
+    """A cell; ``of_value`` is the note for its value, "" for none."""
+    text = f"{aggregate.reason} {of_value}".strip() if aggregate.value is not None else aggregate.reason
     if text not in ("", *notes):
         notes.append(text)
     note = notes.index(text) if text else None
@@ -408,12 +391,12 @@ def _ranked(
         if best is None:
             continue
         competing = _competing(lines, index)
-        shown = {i: float(cells[i][index].text) for i, line in enumerate(lines) if line.method in competing}
-        order = sorted(set(shown.values()), reverse=column.higher_is_better)
-        first = {value for i, value in shown.items() if best.methods and lines[i].method in best.methods}
+        values = {i: float(cells[i][index].text) for i, line in enumerate(lines) if line.method in competing}
+        order = sorted(set(values.values()), reverse=column.higher_is_better)
+        first = {value for i, value in values.items() if best.methods and lines[i].method in best.methods}
         first = first or {order[0]}
         others = [value for value in order if value not in first]
-        for i, value in shown.items():
+        for i, value in values.items():
             rank = 1 if value in first else others.index(value) + 2
             cells[i][index] = replace(cells[i][index], rank=rank)
     return [replace(line, cells=tuple(row)) for line, row in zip(lines, cells)]
@@ -451,51 +434,42 @@ def compact(table: Table) -> Table:
     A column that is left out becomes a sentence in the caption, with its first reason. Columns in which a method failed
     are kept. Notes that no cell refers to are removed.
     """
-    kept = [index for index in range(len(table.columns)) if _has_content(table, index)]
+    cells_of = [*zip(*(row.cells for row in table.rows))]
+    kept = [
+        i
+        for i, cells in enumerate(cells_of)
+        if any(c.value is not None or c.status == "failed" for c in cells)
+    ]
     if not kept:
         return table
     left_out: dict[str, list[str]] = {}
     for index, column in enumerate(table.columns):
         if index not in kept:
-            note = next(
-                (row.cells[index].note for row in table.rows if row.cells[index].note is not None), None
-            )
-            why = "" if note is None else table.notes[note]
+            why = next((table.notes[c.note] for c in cells_of[index] if c.note is not None), "")
             left_out.setdefault(why, []).append(f"{column.title} {column.label}".strip())
     sentences = [
         f"No values of {', '.join(names)}{f': {why}' if why else ''}".rstrip(".") + "."
         for why, names in left_out.items()
     ]
     used: dict[int, int] = {}
+    sign = -1 if table.columns[kept[0]].higher_is_better else 1
 
-    def cells(row: TableRow) -> tuple[TableCell, ...]:
-        own = [row.cells[index] for index in kept]
-        return tuple(
-            cell if cell.note is None else replace(cell, note=used.setdefault(cell.note, len(used)))
-            for cell in own
+    def place(row: TableRow) -> float:
+        value = row.cells[kept[0]].value
+        return inf if value is None else sign * value
+
+    def compacted(row: TableRow) -> TableRow:
+        cells = (row.cells[index] for index in kept)
+        notes = (
+            (cell, None if cell.note is None else used.setdefault(cell.note, len(used))) for cell in cells
         )
+        return replace(row, cells=tuple(replace(cell, note=note) for cell, note in notes))
 
-    columns = tuple(table.columns[index] for index in kept)
-    groups = []
-    for title, rows in table.groups:
-        ordered = sorted(rows, key=lambda row: _place(row.cells[kept[0]], columns[0]))
-        groups.append((title, tuple(replace(row, cells=cells(row)) for row in ordered)))
+    groups = [(title, tuple(map(compacted, sorted(rows, key=place)))) for title, rows in table.groups]
     return replace(
         table,
-        columns=columns,
+        columns=tuple(table.columns[index] for index in kept),
         groups=tuple(groups),
         notes=tuple(table.notes[note] for note in used),
         missing=(*table.missing, *sentences),
     )
-
-
-def _has_content(table: Table, index: int) -> bool:
-    cells = [row.cells[index] for row in table.rows]
-    return any(cell.value is not None or cell.status == "failed" for cell in cells)
-
-
-def _place(cell: TableCell, column: Column) -> float:
-    """Sort key of rows: the value, negated if higher is better; rows without a value last."""
-    if cell.value is None:
-        return inf
-    return -cell.value if column.higher_is_better else cell.value

@@ -175,7 +175,7 @@ def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) ->
         clips = list({job.clip.subject: job.clip for job in jobs}.values())
         rows = run(config, execution, clips=clips, is_locked=True, reports=False).rows
         _write_record(out, drive, rows, settings.others)
-        from ...reports.robustness.sheets import robustness_report
+        from ...reports.contact_sheet import robustness_report
 
         return robustness_report(out)
 

@@ -7,9 +7,8 @@ from PIL import Image
 
 from headbench.bench.protocol import evenly
 from headbench.reports.contact_sheet import compared_frame, contact_sheet
-from headbench.reports.curve.curve import CurveData, write_curve
-from headbench.reports.curve.points import HELD_OUT
-from headbench.reports.plots import cost_axis, plot_file, start_axes
+from headbench.reports.curve.curve import HELD_OUT, CurveData, write_curve
+from headbench.reports.drawing import cost_axis, plot_file, start_axes
 from headbench.reports.runs import SPLIT_TASK, RunData, unseen_cameras
 from headbench.reports.suite.suite import suite_runs
 

@@ -31,7 +31,7 @@ from headbench.bench.executors.settings import Execution
 from headbench.bench.registry import discover, resolve
 from headbench.bench.specs import COMMAND_GROUPS
 from headbench.datasets.lint.catalogue import GROUPS, RULES
-from headbench.reports.method_cards import measured_figures, printed_figures
+from headbench.reports.papers import measured_figures, printed_figures
 
 OBJECT_TYPES = {
     "lint": "lint code",

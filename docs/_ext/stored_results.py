@@ -26,13 +26,11 @@ from headbench.bench.protocol import TASK_TITLES, UNSEEN_CAMERAS
 from headbench.bench.registry import get
 from headbench.bench.rows import FULL, Rows
 from headbench.reports.aggregate import coded_labels, summarise
-from headbench.reports.curve.curve import CurveData, leaders_text, read_curve
-from headbench.reports.curve.points import HELD_OUT
+from headbench.reports.curve.curve import HELD_OUT, CurveData, leaders_text, read_curve
 from headbench.reports.protocols import choice_effects
 from headbench.reports.runs import FrameSelection, RunData, RunSet
 from headbench.reports.statistics.comparisons import PairedComparison, compare
-from headbench.reports.suite.extremes import FOLDER, read_extremes
-from headbench.reports.suite.suite import suite_report, suite_runs
+from headbench.reports.suite.suite import FOLDER, read_extremes, suite_report, suite_runs
 from headbench.reports.table_report import Columns, table_of
 from headbench.reports.tables import build_table
 from headbench.reports.writers import pipe_table, to_markdown, to_text

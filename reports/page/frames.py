@@ -63,7 +63,7 @@ def frame_values(runs: RunSet, metrics: Sequence[MetricSpec]) -> dict[tuple[str,
     found = {}
     for task in runs.tasks:
         for key in runs.keys[task]:
-            for label, (run, name) in runs.shown.items():
+            for label, (run, name) in runs.pictured.items():
                 for spec in metrics:
                     value = run.value(spec.name, name, task, key)
                     if value is not None:
@@ -219,7 +219,7 @@ class _Source:
             return None, without_folders(str(error))
 
     def _render(self, label: str, frame: ShownFrame) -> tuple[ByteArray | None, str]:
-        run, name = self.runs.shown[label]
+        run, name = self.runs.pictured[label]
         try:
             image = run.render(name, frame.task, frame.key)
         except HeadbenchError as error:
@@ -230,7 +230,7 @@ class _Source:
             return None, self.reason(label, frame.task, frame.key.subject)
 
     def _reason(self, label: str, task: str, subject: str) -> str:
-        run, name = self.runs.shown[label]
+        run, name = self.runs.pictured[label]
         return " ".join(run.reason(name, task, FrameKey(subject, "", 0, "")).split())
 
 

@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import tyro
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.engine.config import RunOptions
 from ...bench.engine.store import FinishedRun
 from ...bench.errors import InputError
 from ...bench.io.files import check_kind, check_output_folder, check_writable, write_text
@@ -24,11 +26,11 @@ from ...bench.specs import CommandResult, MetricSpec, command
 from ..aggregate import summarise
 from ..drawing import colour_map
 from ..papers import as_printed, printed_tables
-from ..pareto.points import LATENCY, SIZE, SPEED, pareto_front
+from ..pareto.command import LATENCY, SIZE, SPEED, pareto_front
 from ..runs import FrameSelection, RunSet
 from ..statistics.command import CompareSettings, compare_methods
-from ..table_report import COMPARISON, layouts, table_of
-from ..tables import AVATAR_TITLE, TITLES, Table, compact
+from ..table_report import layouts, table_of
+from ..tables import AVATAR_TITLE, COMPARISON, TITLES, Table, compact
 from ..writers import render_page
 from .frames import Opening, Pictures, ShownFrame, choose_pictures, frame_values, opening, worst_frames
 from .sections import (
@@ -46,7 +48,41 @@ from .sections import (
     verdict,
     write_pictures,
 )
-from .settings import MAX_MB, MAX_SPLIT_MB, PageSettings
+
+MAX_MB, MAX_SPLIT_MB = 10.0, 500.0
+
+
+@dataclass(frozen=True)
+class PageSettings(RunOptions):
+    """Write finished runs to one HTML file: the result in words, frames of all methods side by side, tables, curves, record of
+    the run.
+
+    It needs no network and no other file. Images are chosen to fit in --max-mb: always the worst frames of each method and
+    task, the others evenly over time. With --split the output is a folder, for large runs, whose index.html loads images when
+    they are viewed.
+    """
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of finished runs on the same frames, as for `headbench table`."""
+
+    out: str | None = None
+    """File to write, with --split a folder that is new or holds an earlier report. By default report.html or report."""
+
+    split: bool = False
+    """Write images to separate files, in a folder with the page."""
+
+    max_mb: float | None = None
+    """Maximum size in megabytes (10^6 bytes). By default 10, with --split 500."""
+
+    papers: Annotated[tuple[str, ...], tyro.conf.arg(name="as")] = ()
+    """Papers (`headbench list papers`) in whose table layout the runs are also shown, with the rows of the paper."""
+
+    def __post_init__(self) -> None:
+        if not self.runs:
+            raise ValueError("runs: at least one folder")
+        if self.max_mb is not None and not 0.1 <= self.max_mb <= (most := 4000 if self.split else 1000):
+            raise ValueError(f"max-mb is {self.max_mb}; from 0.1 to {most}")
+
 
 HERE = Path(__file__).parent
 MEGABYTE = 10**6
@@ -219,7 +255,7 @@ def _opening(runs: RunSet, first: Opening) -> dict[str, Any]:
 def _ratio(runs: RunSet, first: Opening) -> str:
     """Width and height of the opening renders, for the page's style."""
     for label in first.methods:
-        run, name = runs.shown[label]
+        run, name = runs.pictured[label]
         path = None if first.frame is None else run.render_path(name, *first.frame)
         if path is not None:
             with suppress(InputError):

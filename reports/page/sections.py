@@ -23,7 +23,7 @@ from ...bench.registry import get
 from ...bench.rows import ALL
 from ...bench.specs import MethodSpec, MetricSpec
 from ..aggregate import mechanisms, summarise
-from ..pareto.points import SIZE, SPEED
+from ..pareto.command import SIZE, SPEED
 from ..runs import RunData, RunSet
 from ..statistics.comparisons import LEVEL, subjects_needed
 from ..tables import BELOW_CAUSES, not_better
@@ -302,7 +302,7 @@ def loss_curves(runs: RunSet) -> list[dict[str, Any]]:
     """
     found = []
     for index, label in enumerate(runs.methods):
-        run, name = runs.shown[label]
+        run, name = runs.pictured[label]
         curves = []
         for clip in run.manifest.clips:
             try:

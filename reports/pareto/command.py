@@ -2,22 +2,330 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, fields
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from statistics import fmean
 
+import numpy as np
+import tyro
+from matplotlib.axes import Axes
+from matplotlib.transforms import Bbox
+
+from ...bench.condition import label_of
 from ...bench.contracts import Progress, no_progress
+from ...bench.engine.config import CODED
 from ...bench.errors import InputError
 from ...bench.io.files import check_output_folder, write_text
 from ...bench.progress import counted
-from ...bench.specs import CommandResult, command
+from ...bench.protocol import TASK_TITLES
+from ...bench.specs import CommandResult, MetricSpec, command
 from ...bench.terminal import table
-from .settings import ParetoSettings
+from ..aggregate import Conditions, conditions, note_of, subject_means, summarise, whole_images
+from ..drawing import GREY, MARKERS, TEXT_POINTS, cost_axis, plot_file, show_missing, start_axes
+from ..runs import RunData, check_same_protocol, joined_subjects, training_labels
+from ..statistics.comparisons import LEAST_SUBJECTS, half_width
+from ..writers import csv_text
 
-if TYPE_CHECKING:
-    from ...bench.specs import MetricSpec
-    from .points import ParetoPoint, RateDifference, RatePoint
+Curve = Sequence[tuple[float, float]]
+"""Megabytes and quality at each step of the codec."""
+LEAST_POINTS = 3
+"""Minimum number of steps of a curve."""
+METRICS = ("psnr", "lpips")
+
+
+def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
+    """Indices of the points on the Pareto front, by increasing cost.
+
+    One point dominates another if it costs no more and is no worse, and is strictly better in one of the two. Equal
+    points do not dominate each other. Lower costs and higher qualities are better; all numbers are finite.
+    """
+    front: list[int] = []
+    for index in sorted(range(len(costs)), key=lambda i: (costs[i], -qualities[i])):
+        point = qualities[index], costs[index]
+        last = (qualities[front[-1]], costs[front[-1]]) if front else None
+        if last is None or point[0] > last[0] or point == last:
+            front.append(index)
+    return front
+
+
+SIZE, SPEED, LATENCY = "storage", "fps", "latency_p50"
+
+
+@dataclass(frozen=True)
+class ParetoPoint:
+    """One method of one run, means over frames, subjects and seeds.
+
+    ``megabytes`` and ``milliseconds`` are None where the run did not measure them. Milliseconds are the
+    median frame time, or the inverse of the mean rate if a run has no median. ``derived_from`` and
+    ``variant`` are "" for a trained avatar.
+    """
+
+    run: str
+    method: str
+    derived_from: str
+    variant: str
+    quality: float
+    megabytes: float | None
+    milliseconds: float | None
+    machine: str
+
+    @property
+    def series(self) -> str:
+        """The method that was trained."""
+        return self.derived_from or self.method
+
+
+def front_of(
+    points: Sequence[ParetoPoint], cost: str, *, higher_is_better: bool, series: str | None = None
+) -> list[int]:
+    """Indices of the front of all points, or of one series, whose cost (a field of `ParetoPoint`) was measured."""
+    among = [i for i, point in enumerate(points) if series in (None, point.series)]
+    known = [i for i in among if getattr(points[i], cost) is not None]
+    sign = 1.0 if higher_is_better else -1.0
+    front = pareto_front([getattr(points[i], cost) for i in known], [sign * points[i].quality for i in known])
+    return [known[i] for i in front]
+
+
+def read_points(
+    runs: Sequence[RunData], task: str, metric: str, time: str = ""
+) -> tuple[list[ParetoPoint], list[str], MetricSpec, str]:
+    """Every method of every run except trivial baselines, as points; return these, omitted methods with reasons,
+    the metric, and a note on frame times that are not comparable ("": all are).
+
+    ``metric`` "" is the first of frames that the runs have; ``time`` names the metric of milliseconds; "" the
+    median latency, or the inverse of the frames per second. Raises `InputError` if runs were scored on
+    different frames or protocols, if one lacks the task or the metric, and if no point remains.
+    """
+    points: list[ParetoPoint] = []
+    left_out: list[str] = []
+    timings: dict[str, Conditions] = {}
+    spec = None
+    for data in runs:
+        folder = data.folder.root
+        data.rows.check()
+        if task not in data.tasks:
+            raise InputError(folder, "task", ", ".join(data.tasks), task)
+        found = next((m for m in data.metrics if m.per_frame and metric in ("", m.name)), None)
+        if found is None:
+            names = ", ".join(m.name for m in data.metrics if m.per_frame)
+            raise InputError(folder, "metric", f"a metric of frames: {names}", metric)
+        metric = found.name
+        spec = spec or found
+        times = [m.name for m in data.metrics if m.unit == "ms"]
+        if time and time not in times:
+            raise InputError(folder, "time", f"a metric in ms: {', '.join(times) or 'none'}", time)
+        check_same_protocol(runs[0], data, task)
+        measured = conditions(data.rows, data.metrics, data.methods)
+        derived = {c.name for c in data.manifest.configuration.conditions if c.derive}
+        for record in data.manifest.methods:
+            if record.trivial:
+                continue
+            label = record.label
+            quality, size, speed, latency = (
+                summarise(data.rows, label, name, where)
+                for name, where in ((metric, task), (SIZE, ""), (SPEED, ""), (time or LATENCY, ""))
+            )
+            if quality.value is None:
+                left_out.append(f"{label} of {folder}: {quality.reason}")
+                continue
+            milliseconds, timed = latency.value, time or LATENCY
+            if milliseconds is None and not time and speed.value:
+                milliseconds, timed = 1000.0 / speed.value, SPEED
+            if milliseconds is not None and label in measured.get(timed, {}):
+                timings[label if len(runs) == 1 else f"{label} of {folder}"] = measured[timed][label]
+            source, variant = (record.name, record.condition) if record.condition in derived else ("", "")
+            costs = size.value, milliseconds
+            points.append(
+                ParetoPoint(str(folder), label, source, variant, quality.value, *costs, data.machine)
+            )
+    if spec is None or not points:
+        found_instead = "; ".join(left_out) or "none"
+        raise InputError("runs", "", "a method, no trivial baseline, with a value", found_instead)
+    return points, left_out, spec, note_of(timings)
+
+
+@dataclass(frozen=True)
+class RatePoint:
+    """A method's coded avatars at one step (``variant``), or those as trained (""): megabytes and quality by subject."""
+
+    method: str
+    variant: str
+    megabytes: Mapping[str, float]
+    quality: Mapping[str, Mapping[str, float]]  # by metric and subject
+
+    def mean(self, metric: str) -> tuple[float, float] | None:
+        """Megabytes and quality, means over subjects; None where a subject has no value."""
+        values = self.quality.get(metric, {})
+        if not self.megabytes or set(values) != set(self.megabytes):
+            return None
+        return float(np.mean([*self.megabytes.values()])), float(np.mean([*values.values()]))
+
+
+@dataclass(frozen=True)
+class RateDifference:
+    """Bjontegaard difference of a method to a reference, percent; negative: fewer bytes at equal quality.
+
+    ``low`` and ``high`` are the 95 % interval over subjects, by Student's t of the logarithm, None with fewer than
+    `LEAST_SUBJECTS`; ``reason`` says why there is no ``percent``.
+    """
+
+    method: str
+    reference: str
+    metric: str
+    percent: float | None
+    low: float | None = None
+    high: float | None = None
+    subjects: int = 0
+    reason: str = ""
+
+
+def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], list[MetricSpec]]:
+    """Coded avatars of runs at their steps, and the metrics of `METRICS` that the runs have; empty without coded ones.
+
+    Several runs may have different steps of one method; a method whose values differ between them has a curve for each
+    training, named as in a `RunSet`. Raises `InputError` for two runs with different values of the same training. Runs of
+    different subjects are joined before (`runs.joined_subjects`).
+    """
+    found: list[tuple[int, RatePoint]] = []
+    metrics = [m for m in runs[0].metrics if m.name in METRICS and m.per_frame] if runs else []
+    for index, run in enumerate(runs):
+        derived = {c.name for c in run.manifest.configuration.conditions if c.derive}
+        steps = {name for name in derived if name == CODED or name.startswith(f"{CODED}-x")}
+        for record in run.manifest.methods:
+            if record.trivial or (record.condition and record.condition not in steps):
+                continue
+            sizes = _by_subject(run, record.label, SIZE, "")
+            quality = {metric.name: _by_subject(run, record.label, metric.name, task) for metric in metrics}
+            found.append((index, RatePoint(record.name, record.condition, sizes, quality)))
+    first = {(point.method, point.variant): point for _, point in reversed(found)}
+    differing = {point.method for _, point in found if point != first[point.method, point.variant]}
+    labels = training_labels(runs) if differing else []
+    points: dict[tuple[str, str], RatePoint] = {}
+    for index, point in found:
+        if point.method in differing:
+            point = replace(point, method=labels[index].get(point.method, point.method))
+        if points.setdefault((point.method, point.variant), point) != point:
+            expected = f"the values of {label_of(point.method, point.variant)} in another run"
+            raise InputError(
+                runs[index].folder.root, "method", expected, "other values", "Give one of the runs."
+            )
+    coded = {point.method for point in points.values() if point.variant}
+    return [point for point in points.values() if point.method in coded], metrics
+
+
+def _by_subject(run: RunData, label: str, metric: str, task: str) -> dict[str, float]:
+    """Mean of a metric by subject; subjects with missing values are left out."""
+    rows = whole_images(run.rows, label, metric, task)
+    bad = set(rows[rows["status"] != "ok"]["subject"])
+    return subject_means(rows[~rows["subject"].isin(bad)])
+
+
+def curve_of(points: Sequence[RatePoint], method: str, metric: str, subject: str) -> Curve:
+    """Megabytes and quality of a method's coded avatars of one subject, by increasing size."""
+    own = [p for p in points if p.method == method and p.variant and subject in p.megabytes]
+    values = [(p.megabytes[subject], p.quality[metric][subject]) for p in own if subject in p.quality[metric]]
+    return sorted(values)
+
+
+def rate_difference(reference: Curve, other: Curve, *, higher_is_better: bool = True) -> float | None:
+    """Mean difference of ln(megabytes) at equal quality, over the common range of quality of both curves.
+
+    Bjontegaard's difference of rates (G. Bjontegaard, "Calculation of average PSNR differences between RD-curves", ITU-T
+    VCEG-M33, 2001) with piecewise cubic Hermite interpolation of the logarithm of the rate in place of one cubic, as in
+    ITU-T HSTP-VID-WPOM (2020), section 4.2. exp(result) - 1 is the BD-rate. Points dominated by others of the same curve
+    are left out, so that quality increases with the rate.
+
+    None with fewer than `LEAST_POINTS` points on a curve, and for curves without a common range of quality.
+    """
+    rates = []
+    for curve in (reference, other):
+        sizes = [size for size, _ in curve]
+        qualities = [quality if higher_is_better else -quality for _, quality in curve]
+        front = pareto_front(sizes, qualities)
+        kept = {qualities[i]: math.log(sizes[i]) for i in front}
+        if len(kept) < LEAST_POINTS:
+            return None
+        rates.append((np.array([*kept]), np.array([*kept.values()])))
+    low = max(float(quality[0]) for quality, _ in rates)
+    high = min(float(quality[-1]) for quality, _ in rates)
+    if not low < high:
+        return None
+    from scipy.interpolate import PchipInterpolator
+
+    one, two = (float(PchipInterpolator(*rate).integrate(low, high)) for rate in rates)
+    return (two - one) / (high - low)
+
+
+def rate_differences(
+    points: Sequence[RatePoint], metrics: Sequence[MetricSpec], reference: str
+) -> list[RateDifference]:
+    """The difference of every method to the reference in every metric: mean over subjects, with an interval."""
+    methods = [name for name in dict.fromkeys(point.method for point in points) if name != reference]
+    subjects = sorted({subject for point in points for subject in point.megabytes})
+    found = []
+    for metric in metrics:
+        for method in methods:
+            values = {
+                subject: rate_difference(
+                    curve_of(points, reference, metric.name, subject),
+                    curve_of(points, method, metric.name, subject),
+                    higher_is_better=metric.higher_is_better,
+                )
+                for subject in subjects
+            }
+            found.append(_difference(method, reference, metric.name, values))
+    return found
+
+
+def _difference(
+    method: str, reference: str, metric: str, values: Mapping[str, float | None]
+) -> RateDifference:
+    lacking = [subject for subject, value in values.items() if value is None]
+    if lacking or not values:
+        reason = (
+            f"{len(lacking)} of {len(values)} subjects have fewer than {LEAST_POINTS} steps of increasing quality, or curves "
+            "without a common range of quality"
+        )
+        return RateDifference(method, reference, metric, None, reason=reason)
+    known = [float(value) for value in values.values() if value is not None]
+    mean, half = fmean(known), half_width(known) if len(known) >= LEAST_SUBJECTS else None
+    low, high = (None, None) if half is None else (_percent(mean - half), _percent(mean + half))
+    return RateDifference(method, reference, metric, _percent(mean), low, high, len(known))
+
+
+def _percent(logarithm: float) -> float:
+    return 100 * math.expm1(logarithm)
+
+
+@dataclass(frozen=True)
+class ParetoSettings:
+    """Quality against size and frame time, over finished runs of the same frames; CSV, and a plot with the front."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    """Folders of finished runs: every method in each is a point, such as the settings of a sweep. Runs of different subjects
+    with the same methods and settings are joined; several trainings of a subject have a curve of rates each."""
+
+    out: str
+    """Folder to write: points.csv and pareto.png; with coded avatars also rates.csv and rate_distortion.png."""
+
+    task: str = "novel_view"
+    """Task whose frames give the quality."""
+
+    metric: str = ""
+    """Metric of quality; default: the first of frames that the runs have."""
+
+    time: str = ""
+    """Metric of frame time, in ms: latency_p50 (default, or 1 / frames per second), processor_time, ..."""
+
+    reference: str = ""
+    """Method that BD-rates compare with, if the runs have coded avatars at several steps; default: the first."""
+
+    def __post_init__(self) -> None:
+        if not self.runs:
+            raise ValueError("runs: at least one folder")
 
 
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
@@ -35,11 +343,6 @@ def pareto(
 ) -> CommandResult:
     """Write ``points.csv`` and ``pareto.png`` of finished runs, and ``rates.csv`` and ``rate_distortion.png`` if they have
     coded avatars at several steps. Runs of different subjects are joined. Raises `InputError` for runs that cannot be compared."""
-    from ..runs import RunData, joined_subjects
-    from ..writers import csv_text
-    from .plot import write_plot
-    from .points import ParetoPoint, front_of, read_points, read_rates
-
     read = joined_subjects([RunData.read(Path(run)) for run in runs])
     points, left_out, metric, note = read_points(read, task, metric_name, time)
     check_output_folder(out)
@@ -82,10 +385,6 @@ def _rates(
     points: Sequence[RatePoint], metrics: Sequence[MetricSpec], out: Path, task: str, reference: str
 ) -> list[RateDifference]:
     """Write the files of rate and distortion; return the differences to the reference, none with fewer than two steps."""
-    from ..writers import csv_text
-    from .plot import write_rates
-    from .points import rate_differences
-
     methods = list(dict.fromkeys(point.method for point in points))
     if reference and reference not in methods:
         raise InputError("command line", "--reference", ", ".join(methods) or "coded avatars", reference)
@@ -133,3 +432,156 @@ def _text(
         lines.append("METHOD+VARIANT was derived from the trained avatar, without training.")
     lines += [f"Frame times: {note}"] if note else []
     return "\n".join([*lines, *(f"left out: {text}" for text in left_out)])
+
+
+MARKER = 7.0
+"""Diameter of a point, in points of 1/72 inch."""
+BESIDE = ((7, -8, "left"), (-7, 3, "right"), (7, 3, "left"), (-7, -8, "right"))
+"""Positions of a label: offset of its lower edge from the point, in points, and its alignment."""
+
+
+def write_plot(
+    path: Path,
+    points: Sequence[ParetoPoint],
+    costs: Mapping[str, str],
+    quality: str,
+    *,
+    higher_is_better: bool,
+) -> None:
+    """Draw quality over each cost (label by field of `ParetoPoint`) side by side and write a PNG, atomically.
+
+    Costs are on a logarithmic axis. Steps connect the front of each series: its best quality up to a cost.
+    Filled points are on the front of all series; squares are trained avatars.
+    """
+    shapes = ""
+    if any(point.variant for point in points):
+        shapes = " Squares: trained; circles: derived from them without training."
+    machines = ", ".join(sorted({point.machine for point in points}))
+    note = f"Lines: Pareto front of each method; filled: of all.{shapes} Measured on {machines}."
+    size = (6.2 * len(costs), 4.9)
+    names = [point.series for point in points]
+    with plot_file(path, size, 200, names, note, line="") as (figure, looks):
+        colours = {name: colour for name, (colour, _) in looks.items()}
+        plots = list(zip(figure.subplots(1, len(costs), squeeze=False)[0], costs))
+        fronts = {}
+        for axes, cost in plots:
+            axes.set(xlabel=costs[cost])
+            start_axes(axes, quality)
+            ends = [
+                front_of(points, cost, higher_is_better=higher_is_better, series=s) for s in (None, *colours)
+            ]
+            fronts[cost] = ends
+            _draw(axes, points, cost, dict(zip(colours, ends[1:])), ends[0], colours)
+        figure.draw_without_rendering()  # compute the layout before placing labels
+        for axes, cost in plots:
+            label_points(axes, points, cost, list(itertools.chain(*fronts[cost])))
+
+
+def write_rates(path: Path, points: Sequence[RatePoint], metrics: Sequence[MetricSpec], task: str) -> None:
+    """Draw quality over megabytes for the steps of the codec: a curve for each method, a panel for each metric.
+
+    Points are labelled with their step. Sizes are on a logarithmic axis; dashed lines are the quality of avatars as trained,
+    whose size is not shown.
+    """
+    names = list(dict.fromkeys(point.method for point in points))
+    subjects = {subject for point in points for subject in point.megabytes}
+    note = (
+        f"Lines: one codec at several steps, multiplied by the number beside a point; dashed: as trained. "
+        f"Means over {counted(len(subjects), 'subject')}."
+    )
+    size = (6.2 * len(metrics), 4.9)
+    with plot_file(path, size, 200, names, note, line="-", markers=MARKERS) as (figure, looks):
+        panels = figure.subplots(1, len(metrics), squeeze=False)[0]
+        for axes, metric in zip(panels, metrics):
+            unit = f", {metric.unit}" if metric.unit else ""
+            axes.set(xlabel="Size, MB")
+            start_axes(axes, f"{metric.label}{unit}, {TASK_TITLES.get(task, task).lower()}")
+            drawn = [_draw_rates(axes, points, metric.name, name, *look) for name, look in looks.items()]
+            if any(drawn):
+                cost_axis(axes)
+            else:
+                show_missing(axes, "not measured in these runs")
+
+
+def _draw_rates(
+    axes: Axes, points: Sequence[RatePoint], metric: str, name: str, colour: str, marker: str
+) -> bool:
+    """Draw the curve of one method; return whether there is one."""
+    own = {point.variant: point.mean(metric) for point in points if point.method == name}
+    trained = own.pop("", None)
+    curve = sorted((*value, variant) for variant, value in own.items() if value is not None)
+    if curve:
+        axes.plot(*list(zip(*curve))[:2], f"{marker}-", color=colour, markersize=MARKER - 2, linewidth=1)
+        for size, value, variant in curve:
+            step = variant.partition("-x")[2] or "1"
+            axes.annotate(
+                step,
+                (size, value),
+                (3, 4),
+                textcoords="offset points",
+                fontsize=TEXT_POINTS - 2,
+                color=colour,
+            )
+    if curve and trained is not None:
+        axes.axhline(trained[1], color=colour, linewidth=0.8, linestyle="--")
+    return bool(curve)
+
+
+def _draw(
+    axes: Axes,
+    points: Sequence[ParetoPoint],
+    cost: str,
+    fronts: Mapping[str, Sequence[int]],
+    best: Sequence[int],
+    colours: Mapping[str, str],
+) -> None:
+    """Points, steps and axis of one panel."""
+    if all(getattr(point, cost) is None for point in points):
+        show_missing(axes, "not measured in these runs")
+        return
+    for name, front in fronts.items():
+        corners = [(getattr(points[i], cost), points[i].quality) for i in front]
+        axes.step(*zip(*corners), where="post", color=colours[name], linewidth=1) if corners else None
+    for index, point in enumerate(points):
+        if getattr(point, cost) is not None:
+            colour = colours[point.series]
+            axes.plot(
+                getattr(point, cost),
+                point.quality,
+                marker="o" if point.variant else "s",
+                markersize=MARKER,
+                color=colour,
+                markerfacecolor=colour if index in best else "white",
+                zorder=3,
+            )
+    cost_axis(axes)
+
+
+def label_points(axes: Axes, points: Sequence[ParetoPoint], cost: str, order: Sequence[int]) -> None:
+    """Write the names of variants next to their points without overlaps, in the given order of indices."""
+    scale = axes.get_figure(root=True).dpi / 72  # type: ignore[union-attr]
+    costs = {i: getattr(point, cost) for i, point in enumerate(points)}
+    places = {i: (value, points[i].quality) for i, value in costs.items() if value is not None}
+    taken = [
+        Bbox.from_bounds(x, y, 0, 0).padded(scale * MARKER / 2)
+        for x, y in axes.transData.transform(list(places.values()) or [(1, 1)])
+    ]
+    for index in dict.fromkeys(order):
+        variant = points[index].variant
+        for right, up, align in BESIDE if variant else ():
+            label = axes.annotate(
+                variant,
+                places[index],
+                (right, up),
+                textcoords="offset points",
+                ha=align,
+                fontsize=7,
+                color=GREY,
+                in_layout=False,
+            )
+            box = label.get_window_extent()
+            inside = axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1
+            if inside and not any(box.overlaps(other) for other in taken):
+                taken.append(box)
+                break
+            label.remove()

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain, combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -19,10 +19,11 @@ from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
 from ...bench.specs import CommandResult, MetricSpec, command
 from ...bench.terminal import table
-
-if TYPE_CHECKING:
-    from ..runs import RunSet
-    from .comparisons import PairedComparison
+from ..aggregate import conditions, note_of
+from ..runs import FrameSelection, RunSet
+from ..tables import AVATAR_TITLE, BELOW_CAUSES, COMPARISON, not_better
+from ..writers import csv_text
+from .comparisons import PairedComparison, compare
 
 
 @dataclass(frozen=True)
@@ -116,8 +117,6 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
 
     Raises `InputError` for invalid combinations of runs, methods and metrics.
     """
-    from ..runs import FrameSelection, RunSet
-
     if settings.baseline is not None:
         from ...bench.gate.command import compare_with_baseline
 
@@ -130,11 +129,6 @@ def compare_methods(
     runs: RunSet, settings: CompareSettings, progress: Progress = no_progress
 ) -> CommandResult:
     """`compare_runs` of loaded runs; runs, region and sequences of the settings are ignored."""
-    from ..aggregate import conditions, note_of
-    from ..table_report import COMPARISON
-    from ..tables import BELOW_CAUSES, not_better
-    from .comparisons import compare
-
     runs = runs.by_camera
     pairs = _pairs(runs, settings.against, settings.trivial)
     known = {spec.name: spec for spec in runs.metrics}
@@ -224,8 +218,6 @@ def equivalence_text(comparison: PairedComparison, unit: str) -> str:
 
 
 def _csv(comparisons: Sequence[dict[str, Any]]) -> str:
-    from ..writers import csv_text
-
     lines: list[list[object]] = [list(FIELDS)]
     for comparison in comparisons:
         first, second = comparison["seeds"]
@@ -236,8 +228,6 @@ def _csv(comparisons: Sequence[dict[str, Any]]) -> str:
 
 def _text(task: str, found: Sequence[tuple[MetricSpec, Sequence[PairedComparison]]], level: float) -> str:
     """The comparisons of a task as a table for a terminal, those of a metric below each other."""
-    from ..tables import AVATAR_TITLE
-
     lines = []
     for spec, comparisons in found:
         unit = f"{spec.unit}, " if spec.unit else ""

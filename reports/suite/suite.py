@@ -8,22 +8,164 @@ from itertools import product
 from math import sqrt
 from pathlib import Path
 from statistics import fmean, stdev, variance
+from typing import Any
 
 from ...bench.engine.store import RunFolder
-from ...bench.experiments.specs import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, SEEDS_RUN, TRACKED
+from ...bench.experiments.specs import AS_TRACKED, EQUAL, LARGE_RUN, RECORD_FILE, RUN, SEEDS_RUN, TRACKED
+from ...bench.experiments.suite_settings import LEVEL
+from ...bench.io.documents import read_json
 from ...bench.progress import counted
-from ...bench.protocol import TASK_TITLES
+from ...bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
 from ...bench.rows import ALL, FULL
 from ..aggregate import means_by_seed, whole_images
-from ..runs import WHOLE, FrameSelection, RunSet
-from ..statistics.command import CompareSettings, compare_methods
+from ..runs import WHOLE, FrameSelection, RunSet, synthetic_settings
+from ..statistics.command import CompareSettings, compare_methods, equivalence_text
 from ..statistics.comparisons import LEVEL as TEST_LEVEL
-from ..statistics.comparisons import PairedComparison, compare, subjects_needed
-from ..statistics.primary import PAIR, primary_section
+from ..statistics.comparisons import PairedComparison, as_one_family, compare, subjects_needed
 from ..table_report import Columns, table_of
 from ..tables import Column, Table, TableCell, TableRow
 from ..writers import pipe_table, to_markdown
-from .extremes import extremes_section, read_extremes
+
+PAIR = ("ours", "ga")
+PRIMARY = tuple(product(("novel_view", SEEN_CAMERAS, UNSEEN_CAMERAS), ("psnr", "lpips")))
+"""Task and metric of each endpoint; `docs/explanation/suite.md` has the same list."""
+MARGINS = {"psnr": 0.3}
+"""Differences within which the methods count as equivalent, in the metric's unit."""
+
+
+def primary_comparisons(runs: RunSet) -> list[PairedComparison]:
+    """The primary endpoints of whole frames, with Holm's correction; empty if the runs lack one of `PAIR` or the metrics."""
+    runs = runs.by_camera
+    specs = {spec.name: spec for spec in runs.metrics}
+    if not {*PAIR} <= {*runs.methods} or not {metric for _, metric in PRIMARY} <= {*specs}:
+        return []
+    found = [
+        compare(
+            *(runs.rows, [PAIR]),
+            task=task,
+            metric=metric,
+            higher_is_better=specs[metric].higher_is_better,
+            margin=MARGINS.get(metric),
+        )
+        for task, metric in PRIMARY
+    ]
+    return as_one_family(each for (each,) in found)
+
+
+def planned_subjects(runs: RunSet) -> int:
+    """Planned number of subjects of the runs' synthetic captures; 0 if not recorded."""
+    settings = [synthetic_settings(clip) for run in runs.runs for clip in run.manifest.clips]
+    return max((int(each.get("subjects", 0)) for each in settings), default=0)
+
+
+def primary_table(runs: RunSet) -> str:
+    """Differences, intervals and verdicts of the primary endpoints as a Markdown table; "" if the runs lack them.
+
+    As long as planned subjects are missing, the results are interim and have no verdict: testing again after
+    each further subject would reject too often.
+    """
+    found = primary_comparisons(runs)
+    if not found:
+        return ""
+    specs, planned = {spec.name: spec for spec in runs.metrics}, planned_subjects(runs)
+    confidence = f"{100 * (1 - TEST_LEVEL):g} % interval"
+    lines = [["endpoint", f"{PAIR[0]} - {PAIR[1]}", confidence, "p", "Holm", "", "equivalence"], ["---"] * 7]
+    for c in found:
+        spec = specs[c.metric]
+        unit = f" ({spec.unit})" if spec.unit else ""
+        head = f"{TASK_TITLES.get(c.task, c.task)}, {spec.label}{unit}"
+        if c.difference is None or c.p is None or c.p_holm is None:
+            lines.append([head, "-", "", "", "", f"{c.verdict}: {c.reason}", ""])
+            continue
+        digits = spec.digits + 1
+        bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f}, {c.high:+.{digits}f}"
+        numbers = [f"{c.difference:+.{digits}f}", bounds, f"{c.p:.4f}", f"{c.p_holm:.4f}"]
+        if c.subjects < planned:
+            lines.append([head, *numbers, f"interim: {c.subjects} of {planned} subjects", ""])
+            continue
+        lines.append([head, *numbers, c.verdict, equivalence_text(c, spec.unit)])
+    how = (
+        "Intervals are Student's t intervals over subjects, not corrected for multiple comparisons; they may exclude 0 where the test does "
+        f"not reject. Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints with values; "
+        "equivalence by two one-sided sign-flip tests, which assume that subjects differ symmetrically about the mean, Holm over "
+        f"these; level {TEST_LEVEL:.0%}."
+    )
+    return f"{pipe_table(lines)}\n\n{how}"
+
+
+def primary_section(runs: RunSet) -> str:
+    """The primary endpoints as Markdown, with the status of the page's other tests."""
+    exploratory = (
+        "All other tests on this page are exploratory. They are corrected over the comparisons of one metric and task, "
+        "including the primary endpoints."
+    )
+    table = (
+        primary_table(runs)
+        or f"These runs have none: primary endpoints compare `{PAIR[0]}` with `{PAIR[1]}`."
+    )
+    return f"## Primary endpoints\n\n{table} {exploratory}"
+
+
+FOLDER = "extremes"
+KEPT = ("subject", "method", "seed", "frames", "frames_broken", "measures", "missing", "no_truth")
+"""Parts of an avatar's record used in the table."""
+
+
+def read_extremes(runs: Sequence[Path]) -> list[dict[str, Any]]:
+    """Records of all avatars of some runs; none for a run without that test."""
+    places = [run / FOLDER / RECORD_FILE for run in runs]
+    found = [avatar for place in places if place.is_file() for avatar in read_json(place)["avatars"]]
+    return [{name: avatar[name] for name in KEPT if name in avatar} for avatar in found]
+
+
+def extremes_section(avatars: Sequence[Mapping[str, Any]]) -> str:
+    """A table as Markdown: mean, worst value and failed frames of every measure by method; "" without avatars.
+
+    A mean is over the frames of a subject, then over subjects; the worst value is that of any frame.
+    """
+    by_method: dict[str, list[Mapping[str, Any]]] = {}
+    for avatar in avatars:
+        by_method.setdefault(avatar["method"], []).append(avatar)
+    rows: list[list[str]] = []
+    notes: dict[str, None] = {}
+    for method, own in by_method.items():
+        for note in (avatar.get("missing") or avatar.get("no_truth") for avatar in own):
+            if note:
+                notes[f"`{method}`: {note}"] = None
+        shown = [avatar for avatar in own if "missing" not in avatar]
+        measures = dict.fromkeys(name for avatar in shown for name in avatar["measures"])
+        for name in measures:
+            found = [avatar["measures"][name] for avatar in shown if name in avatar["measures"]]
+            means = [each["mean"] for each in found if each["mean"] is not None]
+            worst = [(each["mean"] or 0.0, each["worst"]) for each in found if each["worst"] is not None]
+            if not means or not worst:
+                continue
+            # If the worst value is the lowest, higher is better.
+            lowest = sum(low <= mean for mean, low in worst) * 2 > len(worst)
+            extreme = (min if lowest else max)(value for _, value in worst)
+            counts = f"{sum(each['failed'] for each in found)} of {sum(each['frames'] for each in found)}"
+            rows.append(
+                [
+                    method,
+                    name.replace("_", " "),
+                    str(len(means)),
+                    f"{fmean(means):.3f}",
+                    f"{extreme:.3f}",
+                    counts,
+                ]
+            )
+    if not rows:
+        return ""
+    lines = [["method", "measure", "subjects", "mean", "worst", "frames that exceed the limit"], ["---"] * 6]
+    text = pipe_table([*lines, *rows])
+    how = (
+        "Joint samples of expression and jaw along the principal components of training, in views between and beyond the training "
+        "cameras, against the path-traced person in the same pose and view (`headbench run extremes`)."
+    )
+    return "\n\n".join(
+        ["## New poses and views (exploratory)", how, text, *(f"Missing: {note}" for note in notes)]
+    )
+
 
 FIRST_TASK = "novel_view"
 

@@ -2,28 +2,213 @@
 
 from __future__ import annotations
 
+import hmac
+import http
 import importlib
 import io
 import logging
+import secrets
 import socket
+import sys
 import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout, suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
+from unittest import mock
 
-from ...bench.contracts import Progress, no_progress
-from ...bench.errors import InputError, UnavailableError, install_extra
+from ...bench.contracts import HeadPose, Progress, no_progress
+from ...bench.errors import HeadbenchError, InputError, UnavailableError, install_extra, text_of
+from ...bench.io.documents import parse_json
+from ...bench.registry import resolve
 from ...bench.specs import CommandResult, command
-from .live import LOOPBACK, with_live_signal
-from .scene import Scene, open_scene
+from .scene import STANDARD_INPUT, Scene, ViewSettings, open_scene
 from .session import Session
-from .settings import ViewSettings
 
 log = logging.getLogger(__name__)
+
+
+@contextmanager
+def token_required() -> Iterator[str]:
+    """Servers of websockets that start in this context refuse requests without the returned token; viser has no setting for it.
+
+    Pages of other sites can send requests to this machine from its browsers, and other users of it too; neither know the token.
+    Raises `RuntimeError` if no server starts.
+    """
+    import websockets.asyncio.server  # comes with viser
+
+    token, started = secrets.token_urlsafe(24), []
+    serve = websockets.asyncio.server.serve
+
+    def guarded(*args: Any, process_request: Any, **options: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            first, _, rest = request.path.removeprefix("/").partition("/")
+            if not hmac.compare_digest(first.encode(), token.encode()):
+                text = "The address lacks the token. Open the address that was printed.\n"
+                return connection.respond(http.HTTPStatus.FORBIDDEN, text)
+            request.path = f"/{rest}"
+            return process_request(connection, request)
+
+        started.append(True)
+        return serve(*args, process_request=process, **options)
+
+    with mock.patch.object(websockets.asyncio.server, "serve", guarded):
+        yield token
+    if not started:
+        raise RuntimeError("viser started its server in a way that is not known here, without the token")
+
+
+DRIVER = "headbench.datasets.drive.transfer:LiveDriver"
+"""Converts lines to poses of a head model; referred to by name, since this package imports no reader."""
+LOOPBACK = "127.0.0.1"
+LONGEST_LINE = 2**20
+"""Bytes; a frame of blendshapes has 2,000."""
+SILENCE_S = 60.0
+"""Seconds without a line after which a connection is closed."""
+
+
+class LivePoses:
+    """The pose of the latest line, for each head model. Of lines that arrive during a conversion, only the last is used.
+
+    Parameters
+    ----------
+    drivers : Mapping[str, Callable[[str], HeadPose]]
+        Convert a line, by the version of the head model.
+    """
+
+    def __init__(self, drivers: Mapping[str, Callable[[str], HeadPose]]):
+        self._drivers = drivers
+        self._poses: dict[str, HeadPose] = {}
+        self._listeners: set[Callable[[], None]] = set()
+        self._arrived = threading.Condition()
+        self._line: str | None = None
+        self._closed, self._said = False, ""
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def pose(self, version: str) -> HeadPose | None:
+        """The latest pose of a head model, relative to that of the first line; None before a line has arrived."""
+        return self._poses.get(version)
+
+    def put(self, line: str) -> None:
+        """Receive a line."""
+        with self._arrived:
+            self._line = line
+            self._arrived.notify()
+
+    def listen(self, listener: Callable[[], None]) -> None:
+        """Call ``listener`` after each new pose."""
+        self._listeners.add(listener)
+
+    def forget(self, listener: Callable[[], None]) -> None:
+        """Remove a listener."""
+        self._listeners.discard(listener)
+
+    def close(self) -> None:
+        """Stop the thread."""
+        with self._arrived:
+            self._closed = True
+            self._arrived.notify()
+        self._thread.join(timeout=10.0)
+
+    def _run(self) -> None:
+        while True:
+            with self._arrived:
+                self._arrived.wait_for(lambda: self._closed or self._line is not None)
+                line, self._line = self._line, None
+            if self._closed or line is None:
+                return
+            try:
+                self._poses = {version: driver(line) for version, driver in self._drivers.items()}
+            except Exception as error:  # the next line may be a good one
+                if text_of(error) != self._said:  # an invalid signal would repeat the message for each line
+                    self._said = text_of(error)
+                    known = isinstance(error, HeadbenchError)
+                    log.warning("%s", error if known else f"live signal: {self._said}", exc_info=not known)
+                continue
+            for listener in tuple(self._listeners):
+                listener()
+
+
+@contextmanager
+def with_live_signal(scene: Scene, settings: ViewSettings) -> Iterator[Scene]:
+    """The scene with the live signal of the settings, if any; it ends with the block.
+
+    Raises `InputError` for a port that is taken, and a head model file that cannot be read.
+    """
+    if not settings.live:
+        yield scene
+        return
+    make = resolve(DRIVER)
+    heads = {shown.version: shown.form.clip.head for shown in scene.shown}
+    live = LivePoses({version: make(head, settings.signal_head) for version, head in heads.items()})
+    try:
+        with (
+            standard_input(live) if settings.live == STANDARD_INPUT else local_port(live, int(settings.live))
+        ):
+            yield replace(scene, shown=[replace(shown, live=live) for shown in scene.shown])
+    finally:
+        live.close()
+
+
+@contextmanager
+def standard_input(live: LivePoses) -> Iterator[None]:
+    """Read lines of standard input in a thread, which ends with the input or the process."""
+    threading.Thread(target=_read, args=(sys.stdin.buffer, live), daemon=True).start()
+    yield
+
+
+@contextmanager
+def local_port(live: LivePoses, port: int) -> Iterator[int]:
+    """Listen at a local port for one local program at a time; yield the port (a free one for 0)."""
+    try:
+        server = socket.create_server((LOOPBACK, port), backlog=1)
+    except OSError as error:
+        expected = "a port of this machine that is free"
+        raise InputError("command line", "--live", expected, f"{port}: {error}", "Choose another.") from None
+    connected: list[socket.socket] = []
+    thread = threading.Thread(target=_serve, args=(server, live, connected), daemon=True)
+    thread.start()
+    try:
+        yield server.getsockname()[1]
+    finally:
+        for end in (server, *connected):
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+        server.close()
+        thread.join(timeout=10.0)
+
+
+def _serve(server: socket.socket, live: LivePoses, connected: list[socket.socket]) -> None:
+    while True:
+        try:
+            connection, _ = server.accept()
+        except OSError:  # closed
+            return
+        connection.settimeout(SILENCE_S)  # close idle connections, so that another program can connect
+        connected[:] = [connection]
+        with connection, connection.makefile("rb") as stream:
+            _read(stream, live)
+        connected.clear()
+
+
+def _read(stream: BinaryIO, live: LivePoses) -> None:
+    """Receive lines until the end or the first that is not a JSON object, such as a browser's request."""
+    with suppress(OSError):
+        while line := stream.readline(LONGEST_LINE):
+            try:
+                text = line.decode()
+                if not text.strip():
+                    continue
+                parse_json(text, "live signal", "line")
+            except (HeadbenchError, UnicodeDecodeError) as error:
+                log.warning("the live signal has ended: %s", error)
+                return
+            live.put(text)
 
 
 @command("view", group="inspect")
@@ -50,8 +235,6 @@ def view_avatars(settings: ViewSettings, progress: Progress = no_progress) -> Co
 def serving(scene: Scene, settings: ViewSettings) -> Iterator[Any]:
     """A running server, stopped at the end of the block: its ``address`` for browsers, and its ``sessions`` by client."""
     library = viser()
-    from .guard import token_required  # needs packages that come with viser
-
     with redirect_stdout(io.StringIO()), token_required() as token:  # viser prints a banner
         server = library.ViserServer(host=LOOPBACK, port=settings.port, label="headbench", verbose=False)
     server.address = f"http://{LOOPBACK}:{server.get_port()}/{token}/"

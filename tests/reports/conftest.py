@@ -12,7 +12,7 @@ from headbench.bench.engine.store import RunFolder
 from headbench.bench.manifest import Manifest, MethodRecord, ProtocolRecord
 from headbench.bench.rows import Rows
 from headbench.bench.specs import MetricSpec
-from headbench.reports.pareto import plot
+from headbench.reports.pareto import command as pareto
 
 from ..world import run_on
 from .made_rows import TASKS, avatar_row, row
@@ -182,4 +182,4 @@ def write_run(tmp_path, write_manifest):
 def no_plots(monkeypatch):
     """Leave out the drawing of `report pareto`, which takes longer than all else it does."""
     for name in ("write_plot", "write_rates"):
-        monkeypatch.setattr(plot, name, lambda *args, **options: None)
+        monkeypatch.setattr(pareto, name, lambda *args, **options: None)

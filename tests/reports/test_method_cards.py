@@ -3,8 +3,8 @@
 import json
 
 from headbench.bench.registry import discover
-from headbench.reports import method_cards
-from headbench.reports.method_cards import (
+from headbench.reports import papers as method_cards
+from headbench.reports.papers import (
     citations,
     measured_figures,
     measured_text,

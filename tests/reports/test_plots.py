@@ -3,7 +3,7 @@
 import pytest
 from matplotlib.figure import Figure
 
-from headbench.reports.plots import cost_axis
+from headbench.reports.drawing import cost_axis
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ def balls(monkeypatch):
 def no_sheets(monkeypatch):
     """Leave out the drawing of contact sheets, which takes longer than all else that runs on balls do."""
     monkeypatch.setattr(
-        "headbench.reports.robustness.sheets.write_sheet", lambda path, *args, **how: path.touch()
+        "headbench.reports.contact_sheet.write_sheet", lambda path, *args, **how: path.touch()
     )
 
 

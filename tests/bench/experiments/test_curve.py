@@ -20,8 +20,7 @@ from headbench.bench.experiments.curve import CurveSettings, curve_run
 from headbench.bench.experiments.held_out import hold_out
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.reports.curve import curve as report
-from headbench.reports.curve.curve import CurveReportSettings, curve_runs
-from headbench.reports.curve.points import MEASURED
+from headbench.reports.curve.curve import MEASURED, CurveReportSettings, curve_runs
 
 from ...datasets.flat_renderer import flat_pictures
 from ...world import run_on

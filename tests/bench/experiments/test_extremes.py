@@ -29,7 +29,7 @@ from headbench.bench.experiments.specs import MEASURES as STABILITY
 from headbench.bench.io.images import read_png
 from headbench.bench.io.lock import locked
 from headbench.bench.registry import get
-from headbench.reports.robustness.sheets import BROKEN, EXTRAPOLATED, SHEET_FILE
+from headbench.reports.contact_sheet import BROKEN, EXTRAPOLATED, SHEET_FILE
 
 pytestmark = pytest.mark.usefixtures("no_sheets")
 CELLS = {

@@ -29,7 +29,7 @@ from headbench.bench.experiments.reenactment import (
 from headbench.bench.experiments.viewpoints import look_at
 from headbench.bench.io.images import read_png
 from headbench.datasets.head.model import HeadModel
-from headbench.reports.robustness.sheets import SHEET_FILE
+from headbench.reports.contact_sheet import SHEET_FILE
 
 RADIUS, SIDE = 0.1, 96
 CENTER = np.array([0.02, 0.01, 0.03])

@@ -19,7 +19,7 @@ from headbench.bench.experiments.truth import TRUTH_LIMITS, TruthJudge, TruthPai
 from headbench.bench.io.images import quantise
 from headbench.datasets.open import open_clip
 from headbench.datasets.synthetic.capture import synthesize
-from headbench.reports.robustness.sheets import SHEET_FILE, table, write_extremes_sheet
+from headbench.reports.contact_sheet import SHEET_FILE, table, write_extremes_sheet
 from headbench.reports.table_report import table_text
 
 from ...datasets.flat_renderer import flat_pictures

@@ -9,8 +9,7 @@ from scipy.stats import t as student_t
 from headbench.bench.contracts import Budget
 from headbench.bench.io.images import read_png
 from headbench.reports.curve import curve
-from headbench.reports.curve.curve import CurvePanel, Leader, leaders, write_plot
-from headbench.reports.curve.points import CurvePoint, mean_point
+from headbench.reports.curve.curve import CurvePanel, CurvePoint, Leader, leaders, mean_point, write_plot
 
 COSTS = np.geomspace(4.0, 64.0, 3)
 

@@ -7,8 +7,7 @@ import pytest
 from headbench.bench.contracts import FrameKey
 from headbench.bench.engine.store import RunFolder
 from headbench.reports.page import sections
-from headbench.reports.page.report import write_report
-from headbench.reports.page.settings import PageSettings
+from headbench.reports.page.report import PageSettings, write_report
 
 from .test_page import HOSTILE
 

@@ -16,9 +16,8 @@ from headbench.bench.errors import InputError
 from headbench.bench.rows import ALL, Rows
 from headbench.reports.page import frames, sections
 from headbench.reports.page.frames import Pictures, ShownFrame, choose_pictures, frame_values, opening, spread
-from headbench.reports.page.report import write_page, write_report
+from headbench.reports.page.report import PageSettings, write_page, write_report
 from headbench.reports.page.sections import loss_curves
-from headbench.reports.page.settings import PageSettings
 from headbench.reports.runs import RunData, RunSet
 from headbench.reports.table_report import layouts, table_text
 

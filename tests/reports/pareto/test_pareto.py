@@ -21,10 +21,15 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.files import to_jsonable
 from headbench.bench.rows import Row, Rows
 from headbench.bench.specs import MetricSpec
-from headbench.reports.pareto.command import COSTS, pareto_runs
-from headbench.reports.pareto.plot import label_points, write_plot
-from headbench.reports.pareto.points import ParetoPoint, pareto_front
-from headbench.reports.pareto.settings import ParetoSettings
+from headbench.reports.pareto.command import (
+    COSTS,
+    ParetoPoint,
+    ParetoSettings,
+    label_points,
+    pareto_front,
+    pareto_runs,
+    write_plot,
+)
 
 METRICS = [
     MetricSpec("psnr", "PSNR", "dB", True, 2, "m:psnr"),

@@ -17,9 +17,7 @@ from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.rows import Row, Rows
 from headbench.bench.specs import MetricSpec
-from headbench.reports.pareto.command import pareto_runs
-from headbench.reports.pareto.points import rate_difference
-from headbench.reports.pareto.settings import ParetoSettings
+from headbench.reports.pareto.command import ParetoSettings, pareto_runs, rate_difference
 
 STEPS = ("coded-x0.25", "coded-x0.5", "coded", "coded-x2")
 METRICS = [

@@ -14,8 +14,7 @@ from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.io.files import digest_file
 from headbench.bench.io.images import read_png
 from headbench.reports.render import render as module
-from headbench.reports.render.render import render_avatar
-from headbench.reports.render.settings import RenderSettings
+from headbench.reports.render.render import RenderSettings, render_avatar
 
 
 @pytest.fixture

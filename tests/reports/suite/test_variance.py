@@ -9,7 +9,6 @@ import pytest
 
 from headbench.bench.engine.store import RunFolder
 from headbench.reports.runs import RunSet
-from headbench.reports.suite.extremes import extremes_section, read_extremes
 from headbench.reports.suite.suite import (
     CROSSED,
     ENDPOINTS,
@@ -17,6 +16,8 @@ from headbench.reports.suite.suite import (
     components,
     condition_table,
     drop_table,
+    extremes_section,
+    read_extremes,
     suite_report,
     variance_section,
 )

@@ -1,7 +1,6 @@
 import pytest
 
-from headbench.reports.view.scene import open_scene
-from headbench.reports.view.settings import ViewSettings
+from headbench.reports.view.scene import ViewSettings, open_scene
 
 from ...world import small_run
 

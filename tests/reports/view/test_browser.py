@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from headbench.reports.view.scene import ViewSettings
 from headbench.reports.view.server import serving
-from headbench.reports.view.settings import ViewSettings
 
 pytest.importorskip("viser", reason="viser is not installed")
 pytestmark = pytest.mark.commands

@@ -8,9 +8,8 @@ pytest.importorskip("viser", reason="viser is not installed")
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from headbench.reports.view.guard import token_required
-from headbench.reports.view.server import serving
-from headbench.reports.view.settings import ViewSettings
+from headbench.reports.view.scene import ViewSettings
+from headbench.reports.view.server import serving, token_required
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.reports.view import live as module
-from headbench.reports.view.live import LivePoses, local_port, standard_input
-from headbench.reports.view.settings import ViewSettings
+from headbench.reports.view import server as module
+from headbench.reports.view.scene import ViewSettings
+from headbench.reports.view.server import LivePoses, local_port, standard_input
 
 
 def driver(line):
@@ -104,8 +104,8 @@ def test_avatars_show_the_poses_of_lines(scene, method):
     from dataclasses import replace
 
     from headbench.datasets.drive.transfer import LiveDriver
-    from headbench.reports.view.drawing import pose_of
     from headbench.reports.view.scene import LIVE, State
+    from headbench.reports.view.session import pose_of
 
     shown = next(one for one in scene.shown if one.label == method)
     made = LivePoses({shown.version: LiveDriver(shown.form.clip.head, "avatar")})

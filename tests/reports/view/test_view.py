@@ -10,7 +10,9 @@ import pytest
 
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.io.images import read_png
-from headbench.reports.view.drawing import (
+from headbench.reports.view.scene import FreeView, Sliders, State, ViewSettings, open_scene
+from headbench.reports.view.server import view_avatars
+from headbench.reports.view.session import (
     CAPTURED,
     LABEL_PX,
     arrangement,
@@ -20,9 +22,6 @@ from headbench.reports.view.drawing import (
     rotations,
     splats_of,
 )
-from headbench.reports.view.scene import FreeView, Sliders, State, open_scene
-from headbench.reports.view.server import view_avatars
-from headbench.reports.view.settings import ViewSettings
 
 
 def keys(scene, split="train"):

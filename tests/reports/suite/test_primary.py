@@ -11,8 +11,8 @@ from scipy import stats
 from headbench.bench.manifest import MethodRecord
 from headbench.bench.rows import Rows
 from headbench.reports.runs import RunSet
-from headbench.reports.statistics import primary
-from headbench.reports.statistics.primary import MARGINS, PAIR, PRIMARY, primary_comparisons, primary_section
+from headbench.reports.suite import suite as primary
+from headbench.reports.suite.suite import MARGINS, PAIR, PRIMARY, primary_comparisons, primary_section
 
 from ..conftest import LPIPS, PSNR
 from ..made_rows import row
