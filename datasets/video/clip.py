@@ -25,7 +25,7 @@ from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.files import digest, digest_file
 from ...bench.io.images import probe_image
-from ...bench.landmark_network import face_size
+from ...bench.landmark_network import face_size, fetched_network, open_network
 from ...bench.protocol import evenly_with_ends
 from ..clip import CaptureClip
 from ..ga.validate import content_digests

@@ -11,8 +11,16 @@ from statistics import fmean, stdev, variance
 from typing import Any
 
 from ...bench.engine.store import RunFolder
-from ...bench.experiments.specs import AS_TRACKED, EQUAL, LARGE_RUN, RECORD_FILE, RUN, SEEDS_RUN, TRACKED
-from ...bench.experiments.suite_settings import LEVEL
+from ...bench.experiments.specs import (
+    AS_TRACKED,
+    EQUAL,
+    LARGE_RUN,
+    LEVEL,
+    RECORD_FILE,
+    RUN,
+    SEEDS_RUN,
+    TRACKED,
+)
 from ...bench.io.documents import read_json
 from ...bench.progress import counted
 from ...bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS

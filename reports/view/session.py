@@ -19,7 +19,7 @@ import numpy as np
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, HeadPose, SplatAvatar
 from ...bench.errors import HeadbenchError
 from ...bench.experiments.viewpoints import turntable
-from ...bench.io.images import quantise, write_png
+from ...bench.io.images import quantise, write_browser_video, write_png
 from ...bench.io.provenance import COMPOSITE
 from ...bench.registry import resolve
 from .scene import LIVE, NEUTRAL, FreeView, Scene, ShownAvatar, Sliders, State
