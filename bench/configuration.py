@@ -127,8 +127,8 @@ def build_arguments(
     for key in values.keys() & {*harness}:
         raise unknown(source, key, key, names)
     hints = get_type_hints(function)
-    annotations = {name: hints.get(name, Any) if name in values else Any for name in names}
-    kind = TypedDict("Arguments", annotations, total=False)  # type: ignore[misc, operator]
+    kinds = {name: hints.get(name, Any) if name in values else Any for name in names}
+    kind = TypedDict("Arguments", kinds, total=False)  # type: ignore[misc]
     others = any(p.kind == p.VAR_KEYWORD for p in parameters)
     arguments: dict[str, Any] = settings_of(values, kind, source, others=others)
     return arguments

@@ -146,9 +146,10 @@ def settings_of(value: Any, kind: Any, source: Source, prefix: str = "", *, othe
     from pydantic import ValidationError
 
     try:
-        return _settings_validator(kind).validate_python(value, extra="allow" if others else "forbid")
+        return _settings_validator(kind).validate_python([value], extra="allow" if others else "forbid")[0]
     except ValidationError as error:
-        _refuse(error.errors(include_url=False), kind, source, prefix)
+        errors = [{**each, "loc": each["loc"][1:]} for each in error.errors(include_url=False)]
+        _refuse(errors, kind, source, prefix)
 
 
 def shown(value: Any) -> str:
@@ -174,9 +175,12 @@ _CHOICE = "|"
 
 @functools.cache
 def _settings_validator(kind: Any) -> Any:
+    """Validator of a list of ``kind``: a dataclass itself takes no configuration, but inherits that of the list."""
+    from pydantic import ConfigDict, TypeAdapter
     from pydantic_core import SchemaValidator
 
-    return SchemaValidator(_for_settings(_validator(kind).core_schema))
+    adapter = TypeAdapter(list[kind], config=ConfigDict(arbitrary_types_allowed=True))
+    return SchemaValidator(_for_settings(adapter.core_schema))
 
 
 def _for_settings(schema: Any) -> Any:
