@@ -170,12 +170,12 @@ class Lpips:
             return [torch.cat(layer) for layer in zip(*(self._cache[place] for place in places))]
         features = self._features(targets)
         for index, place in enumerate(places):
-            own = [layer[index : index + 1] for layer in features]
-            size = sum(layer.numel() * layer.element_size() for layer in own)
+            layers = [layer[index : index + 1] for layer in features]
+            size = sum(layer.numel() * layer.element_size() for layer in layers)
             # Once the cache is full, nothing is replaced: all methods use the same frame order, so that a new entry would be
             # evicted before its next use.
             if place not in self._cache and self._held + size <= self._cache_bytes:
-                self._cache[place] = [layer.clone() for layer in own]
+                self._cache[place] = [layer.clone() for layer in layers]
                 self._held += size
         return features
 

@@ -409,17 +409,17 @@ def _gradient_error(value: Tensor, truth: Tensor, case: Extreme, name: str) -> f
 
 def special_cases(backend: str) -> dict[str, str]:
     """Faults with non-finite values and other numbers of threads, by case; empty for none."""
-    found = {}
+    results = {}
     for bad in (float("nan"), float("inf"), -float("inf")):
         scene = poisoned(bad)
         try:
             rasterize(*scene[:9], background=scene.background, backend=backend)
-            found[f"{bad} in five splats' inputs"] = "accepted"
+            results[f"{bad} in five splats' inputs"] = "accepted"
         except ValueError as error:
-            found[f"{bad} in five splats' inputs"] = "" if "finite" in str(error) else str(error)
-    found["NaN in the image's gradient at one splat"] = _upstream(backend)
-    found["1, 2, 3 and 8 threads, bit for bit"] = _threads(backend)
-    return found
+            results[f"{bad} in five splats' inputs"] = "" if "finite" in str(error) else str(error)
+    results["NaN in the image's gradient at one splat"] = _upstream(backend)
+    results["1, 2, 3 and 8 threads, bit for bit"] = _threads(backend)
+    return results
 
 
 def poisoned(bad: float) -> SplatScene:

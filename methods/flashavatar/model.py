@@ -160,8 +160,8 @@ class TrainedSplats(SurfaceSplats[FlashAvatarConfig]):
 
     def checked(self, path: Path, head: HeadAsset, device: str) -> TrainedSplats:
         """See `SurfaceSplats.checked`; also bounds the sizes that the network can produce, and the inverses of Gaussians."""
-        found = super().checked(path, head, device)
+        tensors = super().checked(path, head, device)
         check_sizes(path, math.e * self.tensors["log_scales"])
         if self.settings.hyper_gaussians:
             check_diagonals(path, self.tensors)
-        return found
+        return tensors

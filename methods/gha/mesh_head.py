@@ -398,14 +398,14 @@ def tet_grid(low: np.ndarray, high: np.ndarray, spacing: float, device: str = "c
             # The face of each cell towards `outward`, its corners in a cycle.
             ways = [a * u + b * v for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
             cycle = [corner_index(centers + side * step + way) for way in ways]
-            own = center_index(centers)
+            center_number = center_index(centers)
             inside = np.all((centers + outward >= 0) & (centers + outward < cells), 1)
             for corner in ((0, 1, 2), (0, 2, 3)):
-                tets.append(np.stack([own, *(cycle[k] for k in corner)], 1)[~inside])
+                tets.append(np.stack([center_number, *(cycle[k] for k in corner)], 1)[~inside])
             if side == 1:
                 other = center_index((centers + outward)[inside])
                 for k in range(4):
-                    pair = (own[inside], other, cycle[k][inside], cycle[(k + 1) % 4][inside])
+                    pair = (center_number[inside], other, cycle[k][inside], cycle[(k + 1) % 4][inside])
                     tets.append(np.stack(pair, 1))
     joined = np.concatenate(tets)
     edges = vertices[joined[:, 1:]] - vertices[joined[:, :1]]
@@ -470,5 +470,5 @@ def _cases(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
         counts[case] = len(ring) - 2
         for face in range(counts[case]):
             table[case, face] = ring[0], ring[face + 1], ring[face + 2]
-    found = torch.from_numpy(table), torch.from_numpy(counts), torch.tensor(EDGES)
-    return found[0].to(device), found[1].to(device), found[2].to(device)
+    tables = torch.from_numpy(table), torch.from_numpy(counts), torch.tensor(EDGES)
+    return tables[0].to(device), tables[1].to(device), tables[2].to(device)

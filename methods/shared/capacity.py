@@ -148,7 +148,7 @@ class _Samples:
         count = np.isfinite(values).sum(axis=0)
         mean = np.nansum(values, axis=0) / np.maximum(count, 1)
         often = 2 * count >= len(values)
-        found = []
+        coefficients = []
         for picture, gradient in zip(values, self._gradients):
             used = often & np.isfinite(picture)
             # The mean without this picture.
@@ -157,8 +157,8 @@ class _Samples:
             normal = rows.T @ rows
             size = len(normal)
             normal += (RIDGE * np.trace(normal) / size + 1e-12) * np.eye(size)
-            found.append(np.linalg.solve(normal, -rows.T @ residual))
-        return np.array(found)
+            coefficients.append(np.linalg.solve(normal, -rows.T @ residual))
+        return np.array(coefficients)
 
 
 def _face(clip: Clip) -> IntArray:

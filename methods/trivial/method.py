@@ -324,8 +324,8 @@ class NearestCameraAvatar(_ImageAvatar):
             raise InputError("pose", "expression", f"{len(scales)} driving values", f"{len(signal)}")
         distances = (((signals - signal) / scales) ** 2).sum(1)
         # Among equally near timesteps the pose's own is preferred, since tracking may be constant.
-        own = self._index["timesteps"] == (-1 if pose.timestep is None else pose.timestep)
-        row = int(np.lexsort((~own, distances))[0])
+        same_timestep = self._index["timesteps"] == (-1 if pose.timestep is None else pose.timestep)
+        row = int(np.lexsort((~same_timestep, distances))[0])
         available = np.flatnonzero(self._index["images"][row] >= 0)
         origin = np.asarray(pose.translation, np.float64)
         towards = _unit(self._index["centers"][available] - origin)

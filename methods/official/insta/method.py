@@ -227,14 +227,14 @@ class _Surfaces:
 
         Covered pixels beside the mesh are hair.
         """
-        found = self._mesh.seen(pose, camera, coverage)
+        surface = self._mesh.seen(pose, camera, coverage)
         classes = np.zeros((*coverage.shape, 3), np.uint8)
-        classes[found.rows, found.columns, 0] = np.where(
-            found.hit, self._classes[found.triangles.clip(0)], HAIR
+        classes[surface.rows, surface.columns, 0] = np.where(
+            surface.hit, self._classes[surface.triangles.clip(0)], HAIR
         )
         depth = np.zeros(coverage.shape, np.uint16)
-        millimetres = np.rint(np.where(found.hit, MILLIMETRES * found.depths, 0))
-        depth[found.rows, found.columns] = millimetres.clip(0, FARTHEST)
+        millimetres = np.rint(np.where(surface.hit, MILLIMETRES * surface.depths, 0))
+        depth[surface.rows, surface.columns] = millimetres.clip(0, FARTHEST)
         return classes, depth
 
 
