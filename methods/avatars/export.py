@@ -1,4 +1,4 @@
-"""Export of avatars in one pose as splat files for viewers, and the loss of quality."""
+"""Export of avatars in one pose as splat files for viewers, their formats, and the loss of quality."""
 
 from __future__ import annotations
 

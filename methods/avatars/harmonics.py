@@ -1,4 +1,4 @@
-"""Fit of spherical harmonics to view-dependent colours."""
+"""Views of an avatar, and the fit of spherical harmonics to view-dependent colours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The mesh head that initialises the Gaussians: a neutral surface from a network, moved and coloured by networks."""
+"""The mesh head that initialises the Gaussians: a neutral surface from a network, moved and coloured by networks.
+
+The published networks concatenate each point's inputs with a condition (expression, pose) that is the same for all points. Here the
+condition's part of a layer is computed once and added as a bias, which gives the same result with less work.
+"""
 
 from __future__ import annotations
 

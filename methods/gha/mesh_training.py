@@ -1,4 +1,8 @@
-"""The mesh phase: training of a neutral surface, its motion and its colours on images, silhouettes and landmarks."""
+"""The mesh phase: training of a neutral surface, its motion and its colours on images, silhouettes and landmarks.
+
+The deformation network is fitted to the head model's motion of the face: the published network learns motion from landmarks and images
+of thousands of timesteps. A short clip contains few of the directions of the expression code; its head model moves the face in all.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Samples of rays near the mesh, and their positions in canonical space."""
+"""The warp to canonical space by the nearest triangle, and samples of rays near the mesh."""
 
 from __future__ import annotations
 

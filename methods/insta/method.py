@@ -1,4 +1,7 @@
-"""Training of the field on rays of several images; their number is adapted to the number of samples."""
+"""INSTA: Zielonka, Bolkart, Thies, "Instant Volumetric Head Avatars", CVPR 2023, arXiv 2211.12499.
+
+The field is trained on rays of several images; their number is adapted to the number of samples.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Occupied cells of canonical space, and their maximum distance from each triangle.
+"""Occupied cells of canonical space with their maximum distance from each triangle, and rendering along rays.
 
 Instant NGP's grid (Mueller et al. 2022, appendix E.2), limited to the cells near the canonical mesh.
 """

@@ -1,4 +1,13 @@
-"""Folders of one call of the authors' program: its input, and checks that it gets no held-out frames."""
+"""Folders of one call of the authors' program, checks that it gets no held-out frames, and numbering of its renders.
+
+Formats read:
+
+- Renders of GaussianAvatars. Written by ShenhanQian/GaussianAvatars 30cc4bde (`render.py`). Not checked on a file of the
+  program.
+- Renders of GaussianBlendshapes. Written by zjumsj/GaussianBlendshapes a0ab7c01 (`test.py`). Not checked on a file of the
+  program.
+- Renders of INSTA. Written by Zielon/INSTA 0c06b701 (`src/rta/recorder.cu`). Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Common code of trained methods around their training: checks, resuming, loading."""
+"""Common code of trained methods around their training: requirements on the machine, checks, resuming, loading."""
 
 from __future__ import annotations
 

@@ -1,7 +1,11 @@
-"""Quantisation of an avatar's arrays by their visible effect, the same steps in both directions.
+"""Quantisation of an avatar's arrays by their visible effect, the same steps in both directions, and the file of a coded avatar.
 
 A layout (`layouts`) describes the arrays of a method's avatar once, by calls of a `Coder`, which quantises and stores them, or
 reads them back; each call returns the decoded values in both directions.
+
+The file is a safetensors file with one uint8 tensor, ``data``, of the arrays, compressed by lzma, one after the other. Its metadata
+has one key, ``compact``: JSON of `Header`. An array is compressed column by column, since the values of a column are similar; whole
+numbers have folded signs (0, -1, 1, -2, ... are 0, 1, 2, 3, ...), and bytes of equal significance lie together.
 """
 
 from __future__ import annotations

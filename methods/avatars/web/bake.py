@@ -1,4 +1,8 @@
-"""Bakes splat avatars of any method for a web page by sampling their splats in chosen poses."""
+"""Bakes splat avatars of any method for a web page by sampling their splats in chosen poses.
+
+The avatar of a page has splats, linear morphs, skinning by a few joints, and harmonics. All values are in the head's frame, metres:
+the root joint does not rotate, x points to the head's left, y up, z to the front.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,11 @@
 """FlashAvatar by its authors' code.
 
 Xiang et al., "FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Embedding", CVPR 2024.
+
+Of an identity NAME, the loader reads ``metrical-tracker/output/NAME/checkpoint/00000.frame``, numbered from 0, and
+``dataset/NAME/imgs/00001.jpg``, ``alpha/00001.jpg``, ``parsing/00001_neckhead.png`` and ``parsing/00001_mouth.png``, whose numbers are
+one higher. Images are PNG under these names; the loader recognises the format by the content. It takes identity, image size and
+focal lengths from frame 0, and the principal point to be the middle of the image.
 """
 
 from __future__ import annotations
@@ -267,7 +272,7 @@ def write_training(
 def write_list(frames: Sequence[Listed], subject: FlameSubject, name: str, work: Workplace) -> None:
     """Write frames of one camera's intrinsics as an identity, in windows around their images.
 
-    Images are marks, see `..ga.export.mark`; the renderer writes each beside the render. Masks have one pixel.
+    Images are marks, see `..ga.method.mark`; the renderer writes each beside the render. Masks have one pixel.
     """
     white, black = np.full((1, 1), FULL, np.uint8), np.zeros((1, 1), np.uint8)
     for index, frame in enumerate(at_rest(subject.posed, frames)):

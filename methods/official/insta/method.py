@@ -2,6 +2,10 @@
 
 Zielonka, Bolkart, Thies, "Instant Volumetric Head Avatars", CVPR 2023. Their program is C++ and CUDA, built on
 instant-ngp. It takes a scene and a configuration, trains, records the frames of the scene's test split, and ends.
+
+The program reads the format of Metrical Tracker with ``generate.sh``: ``transforms_train.json`` (camera-to-world with OpenCV's axes,
+metres; intrinsics of each frame), ``images`` with straight alpha, ``meshes``, ``flame/exp``, ``depth`` (16 bits, millimetres),
+``seg_mask`` (a class in the red channel), ``canonical.obj``; and ``mesh_masks``, which it opens relative to its working directory.
 """
 
 from __future__ import annotations
