@@ -147,7 +147,7 @@ class Controllers:
     @classmethod
     def of(cls, config: GHAConfig, expression_size: int) -> Controllers:
         """Networks of the configured widths for E driving values."""
-        pose = encoded_size(POSE_SIZE)
+        pose = POSE_SIZE * ENCODING_SIZE // 3
 
         def pair(kind: str, inputs: int, outputs: int) -> Iterator[Mlp]:
             starts = (config.zero_initialised, config.zero_initialised and kind != "color")
@@ -196,11 +196,6 @@ class Controllers:
         """(N, 3) displacements of points, whose (N, 27) encoding is given, each within (-1, 1), before their factor."""
         networks = (self.expression_deform, self.pose_deform)
         return blended(networks, weights, encoded, influences, (expression, pose), tanh_output=True)
-
-
-def encoded_size(size: int) -> int:
-    """Size of the encoding of ``size`` values."""
-    return size * ENCODING_SIZE // 3
 
 
 def encode_pose(code: Tensor) -> Tensor:
