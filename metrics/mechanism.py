@@ -29,8 +29,8 @@ DYNAMIC_SPLATS = MetricSpec(
 
 def _detail(name: str, label: str, summary: str, unit: str = "%", digits: int = 1) -> MetricSpec:
     """Another value measured with `DYNAMIC_SPLATS`."""
-    own = replace(DYNAMIC_SPLATS, name=name, detail=name, label=label, summary=summary)
-    return replace(own, unit=unit, digits=digits)
+    spec = replace(DYNAMIC_SPLATS, name=name, detail=name, label=label, summary=summary)
+    return replace(spec, unit=unit, digits=digits)
 
 
 _SPLATS = "splats that the penalty of ours keeps constant in more than half of the training poses"
@@ -69,20 +69,20 @@ def dynamic_splats(avatar: Avatar, workload: Sequence[tuple[Camera, HeadPose]]) 
     spans = {name: most[name] - least[name] for name in most}
     ranges = {name: span if span.ndim == 1 else span.max(axis=1) for name, span in spans.items()}
     count = len(next(iter(ranges.values()), ()))
-    found = _summary(ranges, np.ones(count, bool), "")
+    details = _summary(ranges, np.ones(count, bool), "")
     if penalised is not None:
         held = penalised > len(workload) / 2
-        found |= _summary(ranges, held, "_penalised") | _summary(ranges, ~held, "_free")
-    return Measurement(found.pop("dynamic"), {"poses": len(workload), "splats": count, **found})
+        details |= _summary(ranges, held, "_penalised") | _summary(ranges, ~held, "_free")
+    return Measurement(details.pop("dynamic"), {"poses": len(workload), "splats": count, **details})
 
 
 def _summary(ranges: dict[str, FloatArray], chosen: BoolArray, suffix: str) -> dict[str, float]:
     """Percentage of dynamic splats, and largest and mean ranges, of the chosen ones; zeros without any."""
     dynamic = np.zeros(int(chosen.sum()), bool)
-    found: dict[str, float] = {}
+    summary: dict[str, float] = {}
     for name, values in ranges.items():
-        own = values[chosen]
-        dynamic |= own > THRESHOLDS[name]
-        found[f"{name}_range{suffix}"] = float(own.max(initial=0.0))
-        found[f"{name}_mean{suffix}"] = float(own.mean()) if len(own) else 0.0
-    return {f"dynamic{suffix}": 100 * float(dynamic.mean()) if len(dynamic) else 0.0, **found}
+        chosen_values = values[chosen]
+        dynamic |= chosen_values > THRESHOLDS[name]
+        summary[f"{name}_range{suffix}"] = float(chosen_values.max(initial=0.0))
+        summary[f"{name}_mean{suffix}"] = float(chosen_values.mean()) if len(chosen_values) else 0.0
+    return {f"dynamic{suffix}": 100 * float(dynamic.mean()) if len(dynamic) else 0.0, **summary}

@@ -90,8 +90,8 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (N, inputs, H, W) to (N, outputs, H / stride, W / stride)."""
-        found = self.bn2(self.conv2(torch.relu(self.bn1(self.conv1(x)))))
-        return torch.relu(found + self.downsample(x))
+        residual = self.bn2(self.conv2(torch.relu(self.bn1(self.conv1(x)))))
+        return torch.relu(residual + self.downsample(x))
 
 
 class Network(nn.Module):
@@ -131,9 +131,9 @@ def decode(maps: list[FloatArray], votes: IntArray) -> FloatArray:
     """
     scores, x, y, neighbour_x, neighbour_y = maps
     best = scores.reshape(len(scores), -1).argmax(axis=1)
-    own = _places(x, y, best)
+    positions = _places(x, y, best)
     neighbours = _places(neighbour_x, neighbour_y, np.repeat(best, NEIGHBOURS))
-    return np.concatenate([own[:, None], neighbours[votes]], axis=1).mean(axis=1)
+    return np.concatenate([positions[:, None], neighbours[votes]], axis=1).mean(axis=1)
 
 
 def _places(x: FloatArray, y: FloatArray, cells: IntArray) -> FloatArray:
@@ -149,8 +149,8 @@ def votes(mean_face: FloatArray) -> IntArray:
     The neighbours of a landmark are the `NEIGHBOURS` nearest to it in the (98, 2) mean face.
     """
     neighbours = _neighbours(mean_face).ravel()
-    found = [np.flatnonzero(neighbours == landmark) for landmark in range(COUNT)]
-    return np.stack([np.resize(one, max(map(len, found))) for one in found])
+    voters = [np.flatnonzero(neighbours == landmark) for landmark in range(COUNT)]
+    return np.stack([np.resize(one, max(map(len, voters))) for one in voters])
 
 
 def _neighbours(mean_face: FloatArray) -> IntArray:

@@ -1,4 +1,4 @@
-"""Peak signal-to-noise ratio of one frame."""
+"""Peak signal-to-noise ratio of one frame, and checks of the images that all metrics compare."""
 
 from __future__ import annotations
 

@@ -66,8 +66,8 @@ def training_time(record: Mapping[str, Any]) -> Measurement:
         raise UnavailableError(f"The training was interrupted {times}.", "Train it in one go for its time.")
     seconds = _number(record, "seconds")
     load = record.get("load", {})
-    known = {name: float(load[name]) for name in ("threads", "cores", "other_cores") if name in load}
-    return Measurement(seconds / 60, {"seconds": seconds, **known})
+    threads = {name: float(load[name]) for name in ("threads", "cores", "other_cores") if name in load}
+    return Measurement(seconds / 60, {"seconds": seconds, **threads})
 
 
 def training_processor(record: Mapping[str, Any]) -> Measurement:

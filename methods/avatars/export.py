@@ -1,4 +1,4 @@
-"""Export of avatars in one pose as splat files for viewers, and the loss of quality."""
+"""Export of avatars in one pose as splat files for viewers, their formats, and the loss of quality."""
 
 from __future__ import annotations
 
@@ -164,18 +164,18 @@ def _read_glb(path: Path) -> StoredSplats:
     content = read_bytes(path, "a GLB file")
     (length,) = struct.unpack_from("<I", content, 12)
     header, start = json.loads(content[20 : 20 + length]), 28 + length
-    found = {}
+    columns = {}
     for name, number in header["meshes"][0]["primitives"][0]["attributes"].items():
         accessor = header["accessors"][number]
         view = header["bufferViews"][accessor["bufferView"]]
         values = np.frombuffer(content, "<f4", view["byteLength"] // 4, start + view["byteOffset"])
-        found[name.removeprefix(f"{EXTENSION}:")] = torch.from_numpy(
+        columns[name.removeprefix(f"{EXTENSION}:")] = torch.from_numpy(
             values.reshape(accessor["count"], -1).copy()
         )
-    harmonics = [found[f"SH_DEGREE_{degree}_COEF_{number}"] for degree, number in HARMONICS]
+    harmonics = [columns[f"SH_DEGREE_{degree}_COEF_{number}"] for degree, number in HARMONICS]
     return StoredSplats(
-        *(found["POSITION"], found["ROTATION"][:, [3, 0, 1, 2]].contiguous()),
-        *(found["SCALE"], found["OPACITY"][:, 0]),
+        *(columns["POSITION"], columns["ROTATION"][:, [3, 0, 1, 2]].contiguous()),
+        *(columns["SCALE"], columns["OPACITY"][:, 0]),
         *(harmonics[0], torch.stack(harmonics[1:], dim=2)),
     )
 

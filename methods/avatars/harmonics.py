@@ -1,4 +1,4 @@
-"""Fit of spherical harmonics to view-dependent colours."""
+"""Views of an avatar, and the fit of spherical harmonics to view-dependent colours."""
 
 from __future__ import annotations
 
@@ -157,14 +157,14 @@ def turn_harmonics(dc: Tensor, rest: Tensor, rotation: Tensor) -> tuple[FloatArr
     count = coefficient_count(DEGREE)
     directions = sphere(4 * count).to(dc.dtype)
     solve = torch.linalg.pinv(sh_basis(directions, DEGREE).double())
-    own = torch.zeros(len(dc), 3, count, dtype=dc.dtype)
-    own[:, :, 0], own[:, :, 1 : 1 + rest.shape[2]] = dc, rest
-    turned = torch.empty_like(own)
+    coefficients = torch.zeros(len(dc), 3, count, dtype=dc.dtype)
+    coefficients[:, :, 0], coefficients[:, :, 1 : 1 + rest.shape[2]] = dc, rest
+    turned = torch.empty_like(coefficients)
     for start in range(0, len(dc), BLOCK):
         rows = slice(start, start + BLOCK)
         along = directions @ rotation[rows]  # (n, M, 3) the directions in the splats' own axes
         basis = sh_basis(along.reshape(-1, 3), DEGREE).view(len(along), -1, count)
-        turned[rows] = (own[rows] @ basis.transpose(1, 2) @ solve.to(dc.dtype).t()).to(dc.dtype)
+        turned[rows] = (coefficients[rows] @ basis.transpose(1, 2) @ solve.to(dc.dtype).t()).to(dc.dtype)
     return turned[:, :, 0].contiguous().numpy(), turned[:, :, 1:].contiguous().numpy()
 
 

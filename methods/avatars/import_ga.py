@@ -75,8 +75,8 @@ def import_avatar(settings: ImportGASettings, progress: Progress = no_progress) 
         (out / DRIVING_FILE).unlink(missing_ok=True)
     write_ga_splats(out / PLY_FILE, splats, binding)
     method = ResolvedMethod(GA_SPEC, GAConfig(), Budget())
-    shown = subject.name, subject.shape, subject.head_model
-    write_avatar_record(out, method, *shown, "import", {"file": digest_file(ply)})
+    identity = subject.name, subject.shape, subject.head_model
+    write_avatar_record(out, method, *identity, "import", {"file": digest_file(ply)})
     used = len(binding.unique())
     triangles = f"{used} of {len(head.faces)} triangles"
     text = f"{out}: {len(binding)} splats on {triangles}, subject {subject.name}"

@@ -1,4 +1,4 @@
-"""Settings of the exports and imports of avatars."""
+"""Settings of the exports, the coded files and the imports of avatars; imports neither torch nor numpy."""
 
 from __future__ import annotations
 

@@ -36,11 +36,6 @@ FLIPPED_MAX = 0.01
 """Maximum fraction of such pixels."""
 
 
-def no_complaint(outcome: DrawnScene) -> str:
-    """No check of the result beyond its errors."""
-    return ""
-
-
 @dataclass(frozen=True)
 class Extreme:
     """A test case with extreme inputs."""
@@ -54,7 +49,7 @@ class Extreme:
     compared: tuple[str, ...] = DIFFERENTIABLE
     """The gradients that have a bound; all must be finite."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    complaint: Callable[[DrawnScene], str] = no_complaint
+    complaint: Callable[[DrawnScene], str] = lambda outcome: ""
     """Further check of the result; returns a fault, or an empty text."""
 
 
@@ -172,10 +167,6 @@ def _crowd(count: int) -> SplatScene:
     scene = facing(count, 8, spread=0.0, scales=uneven(count, 0.003), opacities=[0.0045] * count)
     place = torch.rand(count, 3, generator=torch.Generator().manual_seed(4)) - 0.5
     return scene._replace(means=scene.means + place * torch.tensor([1.7, 1.7, 0.1]))
-
-
-def _one_splat(**fields: Any) -> SplatScene:
-    return facing(1, means=[[0.0, 0.0, 2.0]], scales=uneven(1, 0.2), **fields)
 
 
 def _layers(count: int, opacity: float) -> SplatScene:
@@ -311,7 +302,11 @@ EXTREMES = (
         ),
         complaint=too_faint(0, 1, 2),
     ),
-    Extreme("opacity 1", lambda: _one_splat(opacities=[1.0]), complaint=_clamped_alpha),
+    Extreme(
+        "opacity 1",
+        lambda: facing(1, means=[[0.0, 0.0, 2.0]], scales=uneven(1, 0.2), opacities=[1.0]),
+        complaint=_clamped_alpha,
+    ),
     Extreme("opaque splats one behind the other", lambda: _layers(3, 1.0), complaint=_first_alone),
     Extreme("150 layers of alpha 0.05", lambda: _layers(150, 0.05), gradient=2e-4),
     Extreme("40 layers of alpha 0.98", lambda: _layers(40, 0.98)),
@@ -409,17 +404,17 @@ def _gradient_error(value: Tensor, truth: Tensor, case: Extreme, name: str) -> f
 
 def special_cases(backend: str) -> dict[str, str]:
     """Faults with non-finite values and other numbers of threads, by case; empty for none."""
-    found = {}
+    results = {}
     for bad in (float("nan"), float("inf"), -float("inf")):
         scene = poisoned(bad)
         try:
             rasterize(*scene[:9], background=scene.background, backend=backend)
-            found[f"{bad} in five splats' inputs"] = "accepted"
+            results[f"{bad} in five splats' inputs"] = "accepted"
         except ValueError as error:
-            found[f"{bad} in five splats' inputs"] = "" if "finite" in str(error) else str(error)
-    found["NaN in the image's gradient at one splat"] = _upstream(backend)
-    found["1, 2, 3 and 8 threads, bit for bit"] = _threads(backend)
-    return found
+            results[f"{bad} in five splats' inputs"] = "" if "finite" in str(error) else str(error)
+    results["NaN in the image's gradient at one splat"] = _upstream(backend)
+    results["1, 2, 3 and 8 threads, bit for bit"] = _threads(backend)
+    return results
 
 
 def poisoned(bad: float) -> SplatScene:

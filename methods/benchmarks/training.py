@@ -339,13 +339,16 @@ def _rasteriser(training: SplatTrainer) -> Callable[[], None]:
 
 def profiled(training: SplatTrainer, rounds: int) -> list[Row]:
     """Time of an iteration by operation; operations of compiled passes have the names of their classes."""
-    with profile(activities=[ProfilerActivity.CPU]) as found:
+    with profile(activities=[ProfilerActivity.CPU]) as profiler:
         for _ in range(rounds):
             iterate(training)
-    own = {event.key: 1e-3 * event.self_cpu_time_total / rounds for event in found.key_averages()}
-    whole = sum(own.values())
-    names = sorted(own, key=lambda name: -own[name])
-    rows = [*((name, own[name]) for name in names[:SHOWN]), ("others", sum(own[n] for n in names[SHOWN:]))]
+    milliseconds = {event.key: 1e-3 * event.self_cpu_time_total / rounds for event in profiler.key_averages()}
+    whole = sum(milliseconds.values())
+    names = sorted(milliseconds, key=lambda name: -milliseconds[name])
+    rows = [
+        *((name, milliseconds[name]) for name in names[:SHOWN]),
+        ("others", sum(milliseconds[n] for n in names[SHOWN:])),
+    ]
     return [{"operation": name, "ms": ms, "%": 100 * ms / whole} for name, ms in rows]
 
 

@@ -1,4 +1,12 @@
-"""The model of FlashAvatar: splats on a mesh, the network that translates, rotates and scales them, and the avatar's file."""
+"""The model of FlashAvatar: splats on a mesh, the network that translates, rotates and scales them, and the avatar's file.
+
+The last layer may be one of HyperGaussians: Serifi and Bühler, "HyperGaussians: High-Dimensional Gaussian Splatting for High-Fidelity
+Animatable Face Avatars", CVPR 2026, arXiv 2507.02803; the stored parts and the initialisation are those of the authors' code,
+https://github.com/gserifi/HyperGaussians. Gaussians of every splat over output and latent have conditional means, the outputs: a
+Gaussian has a mean (mu_o, mu_i) and a precision Lambda = L L^T in blocks of output and input, L = [[A, 0], [B, C]] with a positive
+diagonal of A. The mean of the output where the input is x is mu_o - Lambda_oo^-1 Lambda_oi (x - mu_i), which is
+mu_o - A^-T B^T (x - mu_i): C is not needed, and the only inverse is that of a small triangular matrix.
+"""
 
 from __future__ import annotations
 
@@ -160,8 +168,8 @@ class TrainedSplats(SurfaceSplats[FlashAvatarConfig]):
 
     def checked(self, path: Path, head: HeadAsset, device: str) -> TrainedSplats:
         """See `SurfaceSplats.checked`; also bounds the sizes that the network can produce, and the inverses of Gaussians."""
-        found = super().checked(path, head, device)
+        tensors = super().checked(path, head, device)
         check_sizes(path, math.e * self.tensors["log_scales"])
         if self.settings.hyper_gaussians:
             check_diagonals(path, self.tensors)
-        return found
+        return tensors

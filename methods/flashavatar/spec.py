@@ -1,4 +1,7 @@
-"""Spec of FlashAvatar; the implementation is not imported."""
+"""Spec and settings of FlashAvatar; the implementation is not imported.
+
+The defaults are those of the authors' program; iterations are on the scale of its 150,000.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Spec of GaussianAvatars; the implementation is not imported."""
+"""Spec and settings of GaussianAvatars; the implementation is not imported."""
 
 from __future__ import annotations
 

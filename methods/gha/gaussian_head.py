@@ -252,11 +252,12 @@ class SuperResolution:
         return self._finished(colors[0].permute(1, 2, 0), drawn, background)
 
     def _finished(self, colors: Tensor, drawn: FeatureImage, background: Tensor) -> Tensor:
-        """(u H, u W, 3) image of the last layer's (u H, u W, 3) output."""
+        """(u H, u W, 3) image of the last layer's (u H, u W, 3) output; the background where nothing is near."""
         near = enlarged(near_drawn(drawn.alpha), self.upscale)
         if not self.residual:
             return torch.where(near[..., None] > 0, torch.sigmoid(colors), background)
-        return residual_image(colors, *self._plain(drawn), near, background)
+        plain, alpha = self._plain(drawn)
+        return torch.where(near[..., None] > 0, plain + alpha[..., None] * colors, background)
 
     def _plain(self, drawn: FeatureImage) -> tuple[Tensor, Tensor]:
         """(u H, u W, 3) splatted colours and their (u H, u W) alpha."""
@@ -267,11 +268,6 @@ class SuperResolution:
         joined = torch.cat([drawn.colors, drawn.alpha[..., None]], dim=2)
         enlarged = _resized(joined, size, align_corners=False)
         return enlarged[..., :3], enlarged[..., 3]
-
-
-def residual_image(colors: Tensor, plain: Tensor, alpha: Tensor, near: Tensor, background: Tensor) -> Tensor:
-    """(H, W, 3): ``plain + alpha colors`` where the (H, W) ``near`` is above 0, else the (3,) background."""
-    return torch.where(near[..., None] > 0, plain + alpha[..., None] * colors, background)
 
 
 def posed(

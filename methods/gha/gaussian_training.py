@@ -218,8 +218,8 @@ def _zoomed(values: Tensor, zoom: Zoom, upscale: int, outside: Tensor) -> Tensor
 
     def places(size: int, rescaled: int, start: int) -> tuple[Tensor, Tensor]:
         place = torch.arange(size, device=values.device) + upscale * start
-        known = (place >= 0) & (place < upscale * rescaled)
-        return (place / zoom.factor).floor().long().clamp(0, size - 1), known
+        inside = (place >= 0) & (place < upscale * rescaled)
+        return (place / zoom.factor).floor().long().clamp(0, size - 1), inside
 
     (rows, rows_in), (columns, columns_in) = (
         places(*axis) for axis in zip(values.shape[:2], zoom.size, zoom.start, strict=True)

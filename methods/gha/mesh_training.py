@@ -1,4 +1,8 @@
-"""The mesh phase: training of a neutral surface, its motion and its colours on images, silhouettes and landmarks."""
+"""The mesh phase: training of a neutral surface, its motion and its colours on images, silhouettes and landmarks.
+
+The deformation network is fitted to the head model's motion of the face: the published network learns motion from landmarks and images
+of thousands of timesteps. A short clip contains few of the directions of the expression code; its head model moves the face in all.
+"""
 
 from __future__ import annotations
 
@@ -85,8 +89,8 @@ class TrackedMotion(NamedTuple):
         device = self.codes.device
         rows = to_device(torch.randint(self.encoded.shape[0], (POINTS_AT_ONCE,), generator=generator), device)
         drawn = to_device(torch.randint(len(self.codes), (CODES_AT_ONCE,), generator=generator), device)
-        found = self.scale * torch.tanh(network(weights, self.encoded[rows], self.codes[drawn]))
-        squared = (found - self.moves[drawn[:, None], rows]).square().sum(2)
+        displacement = self.scale * torch.tanh(network(weights, self.encoded[rows], self.codes[drawn]))
+        squared = (displacement - self.moves[drawn[:, None], rows]).square().sum(2)
         return (self.weights[rows] * squared).mean()
 
     def fitted(self, network: Mlp, initial: Mapping[str, Tensor], steps: int, seed: int) -> dict[str, Tensor]:
@@ -361,7 +365,7 @@ def _distances(scene: TrainingScene, low: Tensor, high: Tensor) -> tuple[Tensor,
     """(P, 3) points, most of them near the tracked mesh at rest, and their (P,) distances to it, up to `FAR`."""
     head, vertices = scene.clip.head, scene.rest.cpu().double().numpy()
     bounding = outer_vertices(vertices, np.asarray(head.faces), head.regions)
-    known = TangentDistance(vertices, np.asarray(head.faces), bounding)
+    distance = TangentDistance(vertices, np.asarray(head.faces), bounding)
     generator = torch_generator(scene.seed, "gha-start")
     anywhere = low + (high - low) * torch.rand(MESH_PLACES // 4, 3, generator=generator).to(low)
     count = MESH_PLACES - len(anywhere)
@@ -369,7 +373,7 @@ def _distances(scene: TrainingScene, low: Tensor, high: Tensor) -> tuple[Tensor,
     rows = torch.as_tensor(bounding)[torch.randint(len(bounding), (count,), generator=generator)]
     away = torch.randn(count, 3, generator=generator) * torch.rand(count, 1, generator=generator)
     places = torch.cat([scene.rest[rows.to(low.device)] + NEAR * away.to(low), anywhere])
-    distances = known(places.cpu().double().numpy())
+    distances = distance(places.cpu().double().numpy())
     return places, torch.as_tensor(distances).to(places).clamp(-FAR, FAR)
 
 

@@ -157,9 +157,9 @@ class GHAAvatar:
         rest = HeadMotion(torch.eye(3), torch.zeros(3), torch.zeros(POSE_SIZE), torch.eye(4)[0])
         signal = code._replace(expression=code.expression.to(points))
         motion = HeadMotion(*(part.to(points) for part in rest))
-        found = self._head.splats(self._tensors, signal, motion, inputs=self._inputs)
-        values = {"position": 1000 * found.world.means, "opacity": found.opacities}
-        return changes_of({**values, "color": found.features[:, :3].clamp(0, 1)})
+        splats = self._head.splats(self._tensors, signal, motion, inputs=self._inputs)
+        values = {"position": 1000 * splats.world.means, "opacity": splats.opacities}
+        return changes_of({**values, "color": splats.features[:, :3].clamp(0, 1)})
 
     def files(self) -> Sequence[Path]:
         """The tensors and the subject."""

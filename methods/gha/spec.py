@@ -1,4 +1,4 @@
-"""Spec of Gaussian Head Avatar; the implementation is not imported."""
+"""Spec and settings of Gaussian Head Avatar; the implementation is not imported."""
 
 from __future__ import annotations
 

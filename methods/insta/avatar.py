@@ -76,7 +76,7 @@ class InstaAvatar:
         else:
             files = [folder / name for name in (FIELD_FILE, SETTINGS_FILE, SUBJECT_FILE)]
             subject = read_subject(folder / SUBJECT_FILE, head)
-            config = read_settings(folder / SETTINGS_FILE)
+            config = _settings(read_json(folder / SETTINGS_FILE), folder / SETTINGS_FILE)
             arrays = read_npz(folder / FIELD_FILE)
         mesh = SubjectMesh(head, subject.shape, subject.static_offset, "cpu")
         surface = canonical_surface(head, mesh, config)
@@ -157,11 +157,6 @@ SETTINGS = "settings"
 """Key of the settings in the coded file."""
 TABLE = "table"
 """Name of the features of the hash grid."""
-
-
-def read_settings(path: Path) -> InstaConfig:
-    """Read settings from JSON."""
-    return _settings(read_json(path), path)
 
 
 def _settings(values: Mapping[str, Any], path: Path) -> InstaConfig:

@@ -1,4 +1,4 @@
-"""Samples of rays near the mesh, and their positions in canonical space."""
+"""The warp to canonical space by the nearest triangle, and samples of rays near the mesh."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ class Blend:
         falloff = np.full(count, FALLOFF, np.float32)
         if variant == "paper":
             return cls(neighbours, falloff, falloff, np.ones(count, bool), True)
-        apart = touching(head, "lips") | touching(head, "left_ear") | touching(head, "right_ear")
-        eyes = touching(head, "eye_region") & ~apart
-        face = touching(head, "face") & ~apart & ~eyes
+        separate = touching(head, "lips") | touching(head, "left_ear") | touching(head, "right_ear")
+        eyes = touching(head, "eye_region") & ~separate
+        face = touching(head, "face") & ~separate & ~eyes
         own = np.where(face, OFFICIAL_OWN_FALLOFF, ALONE).astype(np.float32)
         return cls(neighbours, own, falloff, eyes, False)
 
@@ -151,16 +151,16 @@ def nearest_triangles(points: Tensor, corners: Tensor) -> Found:
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = torch.nn.functional.normalize(normals, dim=-1, eps=torch.finfo(normals.dtype).tiny)
     chunk = max(1, PAIRS_AT_ONCE // max(len(corners), 1))
-    found = []
+    nearest = []
     for part in points.split(chunk):
         squared = squared_distances(part, corners)
         least = squared.min(1).values
         tied = squared <= least[:, None] * (1 + TIE) + TIE_FLOOR
         plane = ((part[:, None] - corners[None, :, 0]) * normals).sum(-1).abs()
-        found.append((torch.where(tied, plane, -torch.ones_like(plane)).argmax(1), least))
-    if not found:
+        nearest.append((torch.where(tied, plane, -torch.ones_like(plane)).argmax(1), least))
+    if not nearest:
         return Found(points.new_empty(0, dtype=torch.int64), points.new_empty(0))
-    return Found(torch.cat([one for one, _ in found]), torch.cat([other for _, other in found]))
+    return Found(torch.cat([one for one, _ in nearest]), torch.cat([other for _, other in nearest]))
 
 
 def squared_distances(points: Tensor, corners: Tensor) -> Tensor:
@@ -339,8 +339,8 @@ class PosedSurface:
         if self._mesh is None:
             return first_hits(torch.from_numpy(origins), torch.from_numpy(directions), self.corners.float())
         triangles, distances = np.empty(len(origins), np.int32), np.empty(len(origins), np.float32)
-        found = triangles, distances
-        self.surface.module.first_hit(self._mesh, origins, directions, *found, threads())
+        hits = triangles, distances
+        self.surface.module.first_hit(self._mesh, origins, directions, *hits, threads())
         return Found(torch.from_numpy(triangles).long(), torch.from_numpy(distances))
 
     def march(self, rays: Rays, first: np.ndarray, step: float, samples_max: int, space: Space) -> Samples:
@@ -393,11 +393,11 @@ class PosedSurface:
             points = rays.origins[ray] + distances[:, None] * rays.directions[ray]
             close = ((points >= low - padding) & (points <= high + padding)).all(1)
             indices, points = indices[close], points[close]
-            found = self.nearest(points)
-            triangles = found.triangles.numpy()
-            near = found.values.numpy() <= np.maximum(reach[triangles], 0) ** 2
+            nearest = self.nearest(points)
+            triangles = nearest.triangles.numpy()
+            near = nearest.values.numpy() <= np.maximum(reach[triangles], 0) ** 2
             near &= reach[triangles] >= 0
-            away = np.sqrt(found.values.numpy()[near])
+            away = np.sqrt(nearest.values.numpy()[near])
             indices, points, triangles = indices[near], points[near], triangles[near]
             positions, directions = self.to_canonical(points, triangles, rays.directions[ray])
             kept = np.flatnonzero(occupied_at(space, positions))

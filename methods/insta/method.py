@@ -1,4 +1,7 @@
-"""Training of the field on rays of several images; their number is adapted to the number of samples."""
+"""INSTA: Zielonka, Bolkart, Thies, "Instant Volumetric Head Avatars", CVPR 2023, arXiv 2211.12499.
+
+The field is trained on rays of several images; their number is adapted to the number of samples.
+"""
 
 from __future__ import annotations
 
@@ -222,10 +225,10 @@ class InstaTraining:
         colors = torch.from_numpy(image[rows, columns].astype(np.float32) / 255)
         covered = np.full(count, 255) if mask is None else mask[rows, columns]
         coverage = torch.from_numpy(covered.astype(np.float32)[:, None] / 255)
-        found = surface.first_hit(rays)
-        hit, triangles = found.triangles >= 0, found.triangles.clamp_min(0)
+        hits = surface.first_hit(rays)
+        hit, triangles = hits.triangles >= 0, hits.triangles.clamp_min(0)
         bare = hit & self._bare[triangles] & (coverage[:, 0] > 0.001)
-        depth = torch.where(bare, found.values, torch.inf)
+        depth = torch.where(bare, hits.values, torch.inf)
         expression = torch.tensor(np.asarray(pose.expression), dtype=torch.float32)
         return PosedRays(surface, expression, rays), colors, coverage, hit & self.mouth[triangles], depth
 
@@ -263,8 +266,8 @@ def color_loss(color: Tensor, target: Tensor, weights: Tensor, huber: float) -> 
 
 def depth_loss(distance: Tensor, target: Tensor) -> Tensor:
     """Mean over (R,) rays of the distance, metres, between expected and true depth; rays without have infinity."""
-    known = target.isfinite()
-    return (distance - torch.where(known, target, distance.detach())).abs().mean()
+    measured = target.isfinite()
+    return (distance - torch.where(measured, target, distance.detach())).abs().mean()
 
 
 def target_colors(
@@ -272,8 +275,8 @@ def target_colors(
 ) -> Tensor:
     """Colours of (R, 3) pixels with (R, 1) coverage on another background than the recorded one."""
     if config.target_variant == "official":
-        own = (image - (1 - coverage) * recorded_on).clamp(0, 1) / coverage.clamp_min(1 / 255)
-        mixed = coverage * to_linear(own.clamp(0, 1)) + (1 - coverage) * to_linear(background)
+        colors = (image - (1 - coverage) * recorded_on).clamp(0, 1) / coverage.clamp_min(1 / 255)
+        mixed = coverage * to_linear(colors.clamp(0, 1)) + (1 - coverage) * to_linear(background)
         return to_srgb(mixed)
     return recomposited(image, coverage, recorded_on, background)
 

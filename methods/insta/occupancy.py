@@ -1,4 +1,4 @@
-"""Occupied cells of canonical space, and their maximum distance from each triangle.
+"""Occupied cells of canonical space with their maximum distance from each triangle, and rendering along rays.
 
 Instant NGP's grid (Mueller et al. 2022, appendix E.2), limited to the cells near the canonical mesh.
 """
@@ -77,24 +77,26 @@ def render_rays(
         offset = 0
         for number, scene in enumerate(scenes):
             if (first[number] >= 0).any():
-                found = scene.surface.march(
+                samples = scene.surface.march(
                     scene.rays, first[number], marching.step, marching.round_samples, space
                 )
-                first[number] = found.next
-                gathered.append((number, offset, found, scene.rays.jitter[found.rays]))
+                first[number] = samples.next
+                gathered.append((number, offset, samples, scene.rays.jitter[samples.rays]))
             offset += counts[number]
-        if not any(len(found.rays) for _, _, found, _ in gathered):
+        if not any(len(samples.rays) for _, _, samples, _ in gathered):
             continue
-        positions = _joined([found.positions for _, _, found, _ in gathered], device)
-        directions = _joined([found.directions for _, _, found, _ in gathered], device)
-        rays = _joined([found.rays.astype(np.int64) + start for _, start, found, _ in gathered], device)
-        triangles = _joined([found.triangles.astype(np.int64) for _, _, found, _ in gathered], mouth.device)
-        lengths = _joined(
-            [(found.indices + j) * np.float32(marching.step) for _, _, found, j in gathered], device
+        positions = _joined([samples.positions for _, _, samples, _ in gathered], device)
+        directions = _joined([samples.directions for _, _, samples, _ in gathered], device)
+        rays = _joined([samples.rays.astype(np.int64) + start for _, start, samples, _ in gathered], device)
+        triangles = _joined(
+            [samples.triangles.astype(np.int64) for _, _, samples, _ in gathered], mouth.device
         )
-        owners = _joined([np.full(len(found.rays), number) for number, _, found, _ in gathered], device)
+        lengths = _joined(
+            [(samples.indices + j) * np.float32(marching.step) for _, _, samples, j in gathered], device
+        )
+        owners = _joined([np.full(len(samples.rays), number) for number, _, samples, _ in gathered], device)
         rows = torch.where(mouth[triangles].to(device), owners, len(scenes))
-        away = _joined([found.distances for _, _, found, _ in gathered], device)
+        away = _joined([samples.distances for _, _, samples, _ in gathered], device)
         latent = field.latent(parameters, positions, conditions, rows)
         thickness = field.density(latent, away) * marching.step
         values = field.color(parameters, latent, directions)
@@ -342,14 +344,14 @@ def _cells_near(
     half = 0.5 * math.sqrt(3) * cell
     kept = []
     for start in range(0, len(numbers), CELLS_AT_ONCE):
-        part = numbers[start : start + CELLS_AT_ONCE]
-        centers = low + cell * (np.stack(np.unravel_index(part, size), axis=1) + np.float32(0.5))
-        found = surface.rest.nearest(centers)
-        triangles, distances = found.triangles.numpy(), np.sqrt(found.values.numpy())
+        block = numbers[start : start + CELLS_AT_ONCE]
+        centers = low + cell * (np.stack(np.unravel_index(block, size), axis=1) + np.float32(0.5))
+        nearest = surface.rest.nearest(centers)
+        triangles, distances = nearest.triangles.numpy(), np.sqrt(nearest.values.numpy())
         way = centers - surface.rest.corners[triangles, 0].numpy()
         outside = (way * normals[triangles]).sum(1) >= 0
         near = distances <= half + np.where(outside, config.shell_outside, config.shell_inside)
-        kept.append((part[near], triangles[near], distances[near]))
+        kept.append((block[near], triangles[near], distances[near]))
     flat, triangles, distances = (np.concatenate(column) for column in zip(*kept))
     return flat, triangles, distances.astype(np.float32)
 

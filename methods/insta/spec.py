@@ -1,4 +1,4 @@
-"""Spec of INSTA; the implementation is not imported."""
+"""Spec and settings of INSTA; the implementation is not imported."""
 
 from __future__ import annotations
 

@@ -278,9 +278,9 @@ class OfficialMethod(ABC, Generic[Config]):
         work.make()
 
         def on_line(line: str) -> None:
-            found = self.done(line)
-            if found is not None:
-                fit.progress(frames + min(found[0], iterations), frames + iterations, found[1])
+            progress = self.done(line)
+            if progress is not None:
+                fit.progress(frames + min(progress[0], iterations), frames + iterations, progress[1])
 
         shim = self.config.device != "cuda"
         patches = [*self.changes, *(self.patches(fit.clip.head, iterations, checkout) if shim else ())]
@@ -391,8 +391,11 @@ def _read_back(
     """Renders by the names of the index."""
     renders = work.model / method.render_folder
     index = {name: FrameKey(*key) for name, key in read_json(work.root / INDEX).items()}
-    found = {path.name for path in renders.glob(method.render_files)}
-    for what, names in (("lacks", index.keys() - found), ("has besides", found - index.keys())):
+    renders_there = {path.name for path in renders.glob(method.render_files)}
+    for what, names in (
+        ("lacks", index.keys() - renders_there),
+        ("has besides", renders_there - index.keys()),
+    ):
         if names:
             first = min(names)
             named = f" ({index[first]})" if first in index else ""

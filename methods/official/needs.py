@@ -42,6 +42,6 @@ def official(config: OfficialConfig, device: str) -> Iterator[Need]:
     except InputError as error:
         yield Need("environment", "", str(error))
     else:
-        known = {"python": "Python ", "torch": "torch "}
-        found = (f"{known.get(name, '')}{value}" for name, value in versions.items())
-        yield Need("environment", ", ".join(found))
+        labels = {"python": "Python ", "torch": "torch "}
+        parts = (f"{labels.get(name, '')}{value}" for name, value in versions.items())
+        yield Need("environment", ", ".join(parts))

@@ -1,4 +1,4 @@
-"""Specs of the official methods; no implementation is imported."""
+"""Specs and settings of the official methods; no implementation is imported."""
 
 from __future__ import annotations
 

@@ -76,10 +76,10 @@ class VisibleMesh:
         rows, columns = np.nonzero(coverage)
         rays = camera_rays(camera, columns, rows, 0.0)
         surface = self._of(pose)
-        found = surface.first_hit(rays)
+        hits = surface.first_hit(rays)
         along = rays.directions @ np.asarray(camera.world_to_camera[2, :3])
         vertices = np.asarray(surface.vertices.numpy(), np.float64)
-        return VisibleSurface(rows, columns, found.triangles.numpy(), found.values.numpy() * along, vertices)
+        return VisibleSurface(rows, columns, hits.triangles.numpy(), hits.values.numpy() * along, vertices)
 
     def _of(self, pose: HeadPose) -> PosedSurface:
         still = pose_in_head_frame(pose)
@@ -130,12 +130,14 @@ def six_numbers(turns: FloatArray) -> FloatArray:
 
 def at_rest(posed: PosedSubject, frames: Sequence[Listed]) -> list[Listed]:
     """Frames with cameras in the head's frame; poses are unchanged."""
-    found = []
+    frames_at_rest = []
     for start in range(0, len(frames), BATCH):
-        part = frames[start : start + BATCH]
-        motions = posed.motions([frame.pose for frame in part])
-        found += [replace(f, camera=camera_in_head_frame(f.camera, m)) for f, m in zip(part, motions)]
-    return found
+        block = frames[start : start + BATCH]
+        motions = posed.motions([frame.pose for frame in block])
+        frames_at_rest += [
+            replace(f, camera=camera_in_head_frame(f.camera, m)) for f, m in zip(block, motions)
+        ]
+    return frames_at_rest
 
 
 def training_frames(clip: Clip, posed: PosedSubject) -> list[Listed]:

@@ -1,4 +1,13 @@
-"""Folders of one call of the authors' program: its input, and checks that it gets no held-out frames."""
+"""Folders of one call of the authors' program, checks that it gets no held-out frames, and numbering of its renders.
+
+Formats read:
+
+- Renders of GaussianAvatars. Written by ShenhanQian/GaussianAvatars 30cc4bde (`render.py`). Not checked on a file of the
+  program.
+- Renders of GaussianBlendshapes. Written by zjumsj/GaussianBlendshapes a0ab7c01 (`test.py`). Not checked on a file of the
+  program.
+- Renders of INSTA. Written by Zielon/INSTA 0c06b701 (`src/rta/recorder.cu`). Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 
@@ -39,12 +48,12 @@ def _numbered(folder: Path, prefix: str, count: Sequence[int], of: str) -> list[
 
 def _latest(folder: Path, stem: str) -> Path | None:
     """The folder ``<stem>_<iterations>`` with the most iterations, the default of the repositories."""
-    made = {
+    folders = {
         int(match[1]): path
         for path in (folder.iterdir() if folder.is_dir() else ())
         if (match := re.fullmatch(rf"{stem}_(\d{{1,9}})", path.name)) and path.is_dir()
     }
-    return made[max(made)] if made else None
+    return folders[max(folders)] if folders else None
 
 
 def gaussian_avatars(folder: Path, clip: Clip, listing: Listing) -> Renders:
@@ -52,20 +61,20 @@ def gaussian_avatars(folder: Path, clip: Clip, listing: Listing) -> Renders:
     if not listing:
         expected = "a capture in the GaussianAvatars/VHAP layout, whose files give the order"
         raise InputError("command line", "--names", expected, f"another for {clip.subject}", MAP_REMEDY)
-    known = {(key.timestep, key.camera): key for key in every_frame(clip)}
-    found: Renders = {}
+    keys = {(key.timestep, key.camera): key for key in every_frame(clip)}
+    renders: Renders = {}
     for split, frames in listing.items():
-        made = _latest(folder / split, "ours")
-        if made is None or not (made / "renders").is_dir():
+        output = _latest(folder / split, "ours")
+        if output is None or not (output / "renders").is_dir():
             continue
-        images = _numbered(made / "renders", "", [len(frames)], f"transforms_{split}.json")
+        images = _numbered(output / "renders", "", [len(frames)], f"transforms_{split}.json")
         for frame, image in zip(frames, images):
-            if frame in known:
-                found[known[frame]] = Render(image, truth=made / "gt" / image.name)
-    if not found:
+            if frame in keys:
+                renders[keys[frame]] = Render(image, truth=output / "gt" / image.name)
+    if not renders:
         expected = "test/ours_N/renders or val/ours_N/renders, as render.py leaves them in the model's folder"
         raise InputError(folder, "", expected, "neither")
-    return found
+    return renders
 
 
 GBS_TEST_FRAMES = 350
@@ -74,30 +83,30 @@ GBS_TEST_FRAMES = 350
 def gaussian_blendshapes(folder: Path, clip: Clip, listing: Listing) -> Renders:
     """``test/split_<iterations>/pred_<index>.png``: the last 350 frames; ``seq/...``: all of them. On black."""
     frames = _of_one_camera(clip, every_frame(clip))
-    found: Renders = {}
+    renders: Renders = {}
     for name, numbered in (("seq", frames), ("test", frames[-GBS_TEST_FRAMES:])):
-        made = _latest(folder / name, "split")
-        if made is None:
+        output = _latest(folder / name, "split")
+        if output is None:
             continue
         of = "the capture" if name == "seq" else f"its last {GBS_TEST_FRAMES}"
-        images = _numbered(made, "pred_", [len(numbered)], of)
+        images = _numbered(output, "pred_", [len(numbered)], of)
         for key, image in zip(numbered, images):
-            mask, truth = (made / image.name.replace("pred_", other) for other in ("pred_mask_", "gt_"))
-            found[key] = Render(image, mask, truth)
-    if not found:
+            mask, truth = (output / image.name.replace("pred_", other) for other in ("pred_mask_", "gt_"))
+            renders[key] = Render(image, mask, truth)
+    if not renders:
         raise InputError(folder, "", "test/split_N, as test.py leaves it in the model's folder", "none")
-    return found
+    return renders
 
 
 def insta(folder: Path, clip: Clip, listing: Listing) -> Renders:
     """``overlay/<index>.png`` in its output folder: the test split, in the order of mesh names, on black."""
     held_out = {key.sequence for key in clip.splits["self_reenactment"]}
     frames = _of_one_camera(clip, [key for key in every_frame(clip) if key.sequence in held_out])
-    made = folder / "overlay"
-    if not made.is_dir():
+    output = folder / "overlay"
+    if not output.is_dir():
         expected = "overlay, as the program leaves it in experiments/CONFIG/debug of the video's folder"
         raise InputError(folder, "", expected, "none")
-    images = _numbered(made, "", [len(frames)], "transforms_test.json")
+    images = _numbered(output, "", [len(frames)], "transforms_test.json")
     return {key: Render(image, image) for key, image in zip(frames, images)}
 
 
@@ -177,11 +186,13 @@ def check_export(work: Workplace, images: Mapping[str, FrameKey], clip: Clip) ->
         expected, found = "as many images of each training frame", "different numbers"
         raise InputError(work.root, "images", expected, found)
     files = (path for folder in (work.input, work.program) for path in folder.rglob("*"))
-    there = {path.relative_to(work.root).as_posix() for path in files if path.suffix.lower() in _IMAGES}
-    there -= {path for path in there - images.keys() if _is_placeholder(work.root / path)}
+    images_there = {
+        path.relative_to(work.root).as_posix() for path in files if path.suffix.lower() in _IMAGES
+    }
+    images_there -= {path for path in images_there - images.keys() if _is_placeholder(work.root / path)}
     for what, names in (
-        ("an exported image", images.keys() - there),
-        ("exported images alone", there - images.keys()),
+        ("an exported image", images.keys() - images_there),
+        ("exported images alone", images_there - images.keys()),
     ):
         if names:
             raise InputError(

@@ -1,4 +1,4 @@
-"""Tri-planes, lines and the small networks of "ours" that read them."""
+"""Spherical harmonics, and the tri-planes, lines and small networks of "ours"."""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
 """Splats bound to the triangles of a mesh: transforms to world and canonical space, and directions to the camera.
 
 Qian et al., "GaussianAvatars: Rigged 3D Gaussian Splatting", CVPR 2024, section 3.2.
+
+The frames of triangles are those of the code of Qian et al., "GaussianAvatars: Rigged 3D Gaussian Splatting", CVPR 2024, section 3.2.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Attributes of a splat that an expression changes: opacity as published, or others for the ablation.
+"""Attributes of a splat that an expression changes, opacity as published or others for the ablation, and the avatar's file.
 
 "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations" (CVPR 2025,
 arXiv 2504.14967), section 3.3 and Table 4: offsets on position, rotation and scale improve novel views and degrade

@@ -1,4 +1,4 @@
-"""Specs of "ours" and "ours-plus"; the implementation is not imported."""
+"""Specs and settings of "ours" and "ours-plus"; the implementation is not imported."""
 
 from __future__ import annotations
 

@@ -178,10 +178,10 @@ class RGBAvatarTraining(SurfaceTrainer[RGBAvatarConfig]):
         """The trained avatar without splats never seen: those that never had a gradient, or never got a colour ("official")."""
         self._finish_step()
         moments = self.optimiser.moments("colors")
-        shown = self.colored
+        visible = self.colored
         if not self._official:
-            shown = shown | (moments["exp_avg_sq"] > 0).any(1) if moments else torch.ones_like(shown)
-        kept = torch.ones_like(shown) if self._config.online or not bool(shown.any()) else shown
+            visible = visible | (moments["exp_avg_sq"] > 0).any(1) if moments else torch.ones_like(visible)
+        kept = torch.ones_like(visible) if self._config.online or not bool(visible.any()) else visible
         tensors = self.tensors()
         tensors |= {name: tensors[name][kept] for name in PER_SPLAT}
         tensors |= {name: tensors[name][:, kept] for name in SHAPES.values()}

@@ -1,4 +1,8 @@
-"""Spec of RGBAvatar; the implementation is not imported."""
+"""Spec and settings of RGBAvatar; the implementation is not imported.
+
+The defaults are those of the authors' program for a monocular video (``config/offline.yaml``). Iterations are steps of the optimiser,
+each over a batch; the program counts images, ten for each step.
+"""
 
 from __future__ import annotations
 

@@ -214,8 +214,8 @@ def is_finished(folder: Path, run: str) -> bool:
     path = folder / TRAINING_FILE
     if not path.exists():
         return False
-    found = read_json(path).get("run")
-    if found != run:
+    recorded = read_json(path).get("run")
+    if recorded != run:
         expected = "the same method, clip, settings, budget and seed"
         remedy = "Use another output folder, or delete this one."
         raise InputError(path, "run", expected, "the avatar of another run", remedy)

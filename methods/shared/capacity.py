@@ -3,6 +3,12 @@
 The configured sizes are upper limits. A method's plan reduces them to what cameras, poses and pictures of the training split
 require: no directions of expression that do not move the surface, or whose motion is noise of the tracker (`evidence`), and no
 more splats than pixels. docs/explanation/methods/ours.md has measurements.
+
+Coefficients alone do not distinguish motion from the tracker's noise; images do. The mesh is posed with the mean expression and jaw of
+the training timesteps and the tracked motion of the head. Where the face deforms, a picture differs there from the mean of the other
+timesteps' pictures. One step of photometric alignment (Lucas and Kanade 1981, on the mesh and in all cameras at once) turns this
+difference into coefficients, without the tracked ones. If these are motion, they agree with those of the pictures at the same
+timesteps; if they are noise, they agree no better than with those of other timesteps. Only frames of the training split are read.
 """
 
 from __future__ import annotations
@@ -147,7 +153,7 @@ class _Samples:
         count = np.isfinite(values).sum(axis=0)
         mean = np.nansum(values, axis=0) / np.maximum(count, 1)
         often = 2 * count >= len(values)
-        found = []
+        coefficients = []
         for picture, gradient in zip(values, self._gradients):
             used = often & np.isfinite(picture)
             # The mean without this picture.
@@ -156,8 +162,8 @@ class _Samples:
             normal = rows.T @ rows
             size = len(normal)
             normal += (RIDGE * np.trace(normal) / size + 1e-12) * np.eye(size)
-            found.append(np.linalg.solve(normal, -rows.T @ residual))
-        return np.array(found)
+            coefficients.append(np.linalg.solve(normal, -rows.T @ residual))
+        return np.array(coefficients)
 
 
 def _face(clip: Clip) -> IntArray:

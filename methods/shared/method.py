@@ -1,4 +1,4 @@
-"""Common code of trained methods around their training: checks, resuming, loading."""
+"""Common code of trained methods around their training: requirements on the machine, checks, resuming, loading."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def splats(config: Any, device: str) -> Iterator[Need]:
         yield cpu.KERNEL.need()
         return
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
-    there = importlib.util.find_spec("gsplat") is not None
+    installed = importlib.util.find_spec("gsplat") is not None
     slow = f"{cuda.REMEDY} The slow reference backend is used instead."
     yield Need("GPU", gpu, "PyTorch with CUDA, and an NVIDIA driver: https://pytorch.org/get-started.")
-    yield Need("gsplat", "installed" if there else "", slow, required=False)
-    if there and not cuda.compiled():
+    yield Need("gsplat", "installed" if installed else "", slow, required=False)
+    if installed and not cuda.compiled():
         yield Need("CUDA toolkit", cuda.toolkit(), cuda.toolkit_remedy())
 
 

@@ -1,4 +1,4 @@
-"""Adam over named groups whose per-splat tensors may grow and shrink."""
+"""Adam over named groups whose per-splat tensors may grow and shrink, densification, penalties, and small networks."""
 
 from __future__ import annotations
 

@@ -284,7 +284,10 @@ class BoundTraining(SplatTrainer):
         extent = scene_extent(self.cameras, scene_center(clip.poses[key.timestep] for key in self.keys))
         start = start or one_per_triangle(face_count, settings.initial_opacity, device)
         splats = {
-            **_initial_geometry(start, settings, extent),
+            "means": (start.means, settings.position_lr * extent),
+            "log_scales": (torch.zeros_like(start.means), settings.scale_lr),
+            "quats": (unturned(len(start.means)).to(start.means), settings.rotation_lr),
+            "opacities": (torch.logit(start.opacities), settings.opacity_lr),
             **appearance.splat_parameters(len(start.binding)),
         }
         self._start(splats, appearance.parameters(), start.binding, face_count, extent, seed)
@@ -315,14 +318,3 @@ def splat_penalties(means: Tensor, log_scales: Tensor, visible: Tensor, settings
     of_position = position_penalty(means, visible, settings.position_threshold)
     of_scale = scale_penalty(log_scales, visible, settings.scale_threshold)
     return settings.position_weight * of_position + settings.scale_weight * of_scale
-
-
-def _initial_geometry(
-    start: Start, settings: SplatTraining, extent: float
-) -> dict[str, tuple[Tensor, float]]:
-    return {
-        "means": (start.means, settings.position_lr * extent),
-        "log_scales": (torch.zeros_like(start.means), settings.scale_lr),
-        "quats": (unturned(len(start.means)).to(start.means), settings.rotation_lr),
-        "opacities": (torch.logit(start.opacities), settings.opacity_lr),
-    }

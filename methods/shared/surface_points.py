@@ -1,4 +1,4 @@
-"""Points spread evenly over a triangle mesh, given by triangle and barycentric coordinates."""
+"""The posed mesh of a subject, and points spread evenly over a triangle mesh, given by triangle and barycentric coordinates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,12 @@
-"""Tensors in safetensors files, validated on reading like the arrays of an npz."""
+"""Files of tensors, written atomically and checked when read: safetensors, checkpoints, and PLY files of one vertex table.
+
+A checkpoint is a safetensors file. Its metadata has one key, ``checkpoint``: JSON with ``layout``, ``run``, ``state`` and
+``digest``. In the state, tensors are referenced by number, and containers have their type.
+
+Formats read:
+
+- PLY of splats. Written by ShenhanQian/GaussianAvatars 30cc4bde (`scene/gaussian_model.py`). Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 

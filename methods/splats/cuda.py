@@ -188,8 +188,8 @@ def draw(gsplat: Any, request: Request) -> Rendering:
         means2d = means2d + request.means2d_offset
     with torch.no_grad():
         # 1.6 skips tiles that intersect a splat's box but not its ellipse.
-        known = inspect.signature(gsplat.isect_tiles).parameters
-        ellipses = {"conics": conics, "opacities": opacities.contiguous()} if "conics" in known else {}
+        parameters = inspect.signature(gsplat.isect_tiles).parameters
+        ellipses = {"conics": conics, "opacities": opacities.contiguous()} if "conics" in parameters else {}
         _, keys, splats = gsplat.isect_tiles(means2d, radii, depths, TILE, columns, rows, **ellipses)
         offsets = gsplat.isect_offset_encode(keys, 1, columns, rows)
     channels = request.colors.shape[-1]

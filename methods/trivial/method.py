@@ -1,6 +1,8 @@
-"""Baselines without learning: the mean image, and the nearest training image.
+"""Baselines without learning: the mean image, the nearest training image, and the posed mesh with the median colours.
 
 They put metrics into perspective: a method that does not clearly beat them has learned little.
+
+Where the textured mesh is as good as a trained method, the training is at fault; where all are about equal, the tracking is.
 """
 
 from __future__ import annotations
@@ -324,8 +326,8 @@ class NearestCameraAvatar(_ImageAvatar):
             raise InputError("pose", "expression", f"{len(scales)} driving values", f"{len(signal)}")
         distances = (((signals - signal) / scales) ** 2).sum(1)
         # Among equally near timesteps the pose's own is preferred, since tracking may be constant.
-        own = self._index["timesteps"] == (-1 if pose.timestep is None else pose.timestep)
-        row = int(np.lexsort((~own, distances))[0])
+        same_timestep = self._index["timesteps"] == (-1 if pose.timestep is None else pose.timestep)
+        row = int(np.lexsort((~same_timestep, distances))[0])
         available = np.flatnonzero(self._index["images"][row] >= 0)
         origin = np.asarray(pose.translation, np.float64)
         towards = _unit(self._index["centers"][available] - origin)

@@ -114,12 +114,12 @@ def write_coded(
 
     Returns the bytes of each part of `Precision`.
     """
-    layout, source, subject, own = parts
+    layout, source, subject, texts = parts
     person = {"shape": subject.shape, "static_offset": subject.static_offset}
     # A digest names individual steps that are not the defaults.
     digest_of = "" if precision.parts == Precision().parts else f" ({digest(precision.parts)[:8]})"
     codec = f"{CODEC_VERSION}, steps x{precision.step:g}{digest_of}"
-    text = {"name": subject.name, "head_model": subject.head_model, **own, CODEC: codec}
+    text = {"name": subject.name, "head_model": subject.head_model, **texts, CODEC: codec}
     coder = Coder(precision.scaled, text, replace(source, tensors={**source.tensors, **person}))
     layout(coder, head, code_subject(coder, head))
     assert not coder.left
@@ -231,8 +231,8 @@ def _rgbavatar(avatar: RGBAvatarAvatar, head: HeadAsset, clip: Clip | None) -> P
     stored, metrics = avatar.stored, {}
     if clip is not None:  # the second moments of the blendshapes' weights in training
         inputs = tracked_inputs(avatar.mesh.arguments(training_poses(clip)), stored.settings.inputs)
-        found = blend_weights(stored.tensors, inputs).double().cpu().numpy()
-        metrics["shapes"] = np.kron(found.T @ found / len(found), np.eye(10))
+        weights = blend_weights(stored.tensors, inputs).double().cpu().numpy()
+        metrics["shapes"] = np.kron(weights.T @ weights / len(weights), np.eye(10))
     shapes = torch.cat([stored.tensors[name] for name in SHAPES.values()], dim=2)  # (K, N, 10)
     tensors = {name: value for name, value in stored.tensors.items() if name not in SHAPES.values()}
     return _surface(
@@ -257,9 +257,11 @@ def _surface(
 ) -> Parts:
     """Parts of splats on a surface; ``shapes`` has a row for each splat, too."""
     stored = avatar.stored
-    own = {"shapes", *(name for name, shape in stored.shapes(head).items() if shape[0] == "N")}
-    splats = {name: value for name, value in tensors.items() if name in own} | point_tensors(stored.points)
-    others = {name: value for name, value in tensors.items() if name not in own}
+    rowwise = {"shapes", *(name for name, shape in stored.shapes(head).items() if shape[0] == "N")}
+    splats = {name: value for name, value in tensors.items() if name in rowwise} | point_tensors(
+        stored.points
+    )
+    others = {name: value for name, value in tensors.items() if name not in rowwise}
     source = _Splats(avatar, clip, stored.points.triangles).source(splats, others, metrics)
     return Parts(layout, source, avatar.subject, {stored.KEY: stored.text()})
 
@@ -298,8 +300,8 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
             step = plan(clip, needs, stored.heads)
             form = AdaptedClip(clip) if step is None else apply(step, needs, kept, f"adapting {clip.subject}")
             comparison = Comparison(clip, form, exact, settings.frames, settings.scale)
-        own = None if form is None else form.clip
-        prepared = parts_of(exact, head, own)
+        adapted = None if form is None else form.clip
+        prepared = parts_of(exact, head, adapted)
         parts = write_coded(prepared, head, out, settings.precision, driving)
         source = {"of": avatar_digest(folder), "precision": asdict(settings.precision)}
         record = stored.record
@@ -311,7 +313,7 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
             data["splats"] = len(exact.splats(neutral_pose(head)).means)
         data["whole"] = {"exact_bytes": size, "compact_bytes": (out / COMPACT_FILE).stat().st_size}
         data["parts"] = {part: {"compact_bytes": size} for part, size in parts.items()}
-        if own is not None:
+        if adapted is not None:
             steps = {name: step for name, step in settings.precision.scaled.parts.items() if name in parts}
             variants = {name: replace(EXACT, **{name: step}) for name, step in steps.items()}
             quality = {}

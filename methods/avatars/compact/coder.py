@@ -1,7 +1,11 @@
-"""Quantisation of an avatar's arrays by their visible effect, the same steps in both directions.
+"""Quantisation of an avatar's arrays by their visible effect, the same steps in both directions, and the file of a coded avatar.
 
 A layout (`layouts`) describes the arrays of a method's avatar once, by calls of a `Coder`, which quantises and stores them, or
 reads them back; each call returns the decoded values in both directions.
+
+The file is a safetensors file with one uint8 tensor, ``data``, of the arrays, compressed by lzma, one after the other. Its metadata
+has one key, ``compact``: JSON of `Header`. An array is compressed column by column, since the values of a column are similar; whole
+numbers have folded signs (0, -1, 1, -2, ... are 0, 1, 2, 3, ...), and bytes of equal significance lie together.
 """
 
 from __future__ import annotations
@@ -227,19 +231,19 @@ class Coder:
         return self.arrays[name]
 
     def _floats(self, name: str, values: np.ndarray | None, part: str) -> FloatArray:
-        found = self._pass(name, None if values is None else values.astype(np.float32), part)
-        if found.dtype.kind != "f":
+        array = self._pass(name, None if values is None else values.astype(np.float32), part)
+        if array.dtype.kind != "f":
             raise ValueError(f"{name} has whole numbers")
-        return found
+        return array
 
     def _levels(self, name: str, values: np.ndarray | None, part: str) -> IntArray:
         """Whole numbers below 2^30; others are rounded."""
         if values is not None:
             values = np.rint(values.astype(np.float64)).clip(-(2**30), 2**30 - 1).astype(np.int64)
-        found = self._pass(name, values, part)
-        if found.dtype.kind != "i":
+        array = self._pass(name, values, part)
+        if array.dtype.kind != "i":
             raise ValueError(f"{name} has no whole numbers")
-        return found
+        return array
 
     def exact(self, name: str, values: Values | None = None, part: str = "other") -> FloatArray:
         """An array as float32."""
@@ -260,21 +264,21 @@ class Coder:
         """An array rounded to multiples of the part's step times ``unit`` from ``base``, float32; exact for step 0."""
         if not (step := getattr(self.precision, part)):
             return self.exact(name, values, part)
-        found, steps = self._values(name, values), step * np.asarray(unit, np.float64)
-        found = None if found is None else (found.astype(np.float64) - base) / steps
-        return (_times(self._levels(name, found, part), steps) + base).astype(np.float32)
+        levels, steps = self._values(name, values), step * np.asarray(unit, np.float64)
+        levels = None if levels is None else (levels.astype(np.float64) - base) / steps
+        return (_times(self._levels(name, levels, part), steps) + base).astype(np.float32)
 
     def matrix(self, name: str, part: str, step: float, values: FloatArray | None = None) -> FloatArray:
         """Weights with a row for each output, rounded relative to the largest of their row; exact for step 0."""
-        found = self._values(name, None) if values is None else values
+        weights = self._values(name, None) if values is None else values
         if not step:
-            return self._floats(name, found, part)
+            return self._floats(name, weights, part)
         steps = None
-        if found is not None:
-            largest = step * np.abs(found).max(tuple(range(1, found.ndim)), initial=0, keepdims=True)
+        if weights is not None:
+            largest = step * np.abs(weights).max(tuple(range(1, weights.ndim)), initial=0, keepdims=True)
             steps = np.where(largest > 0, largest, 1.0)
         steps = self._floats(f"{name}/steps", steps, part).astype(np.float64)
-        levels = self._levels(name, None if found is None else found / steps, part)
+        levels = self._levels(name, None if weights is None else weights / steps, part)
         return _times(levels, steps).astype(np.float32)
 
     def vectors(
@@ -309,8 +313,8 @@ class Coder:
                 shares = np.ones(len(given))
             basis, chosen = _transformed(given, metric, shares / max(shares.sum(), 1e-30), step * scale)
         basis = self.matrix(f"{name}/basis", part, BASIS_STEP, basis).astype(np.float64)
-        found = _times(self._levels(name, chosen, part), step * scale) @ basis
-        return (found * _columns(units, found.shape[1])).astype(np.float32)
+        decoded = _times(self._levels(name, chosen, part), step * scale) @ basis
+        return (decoded * _columns(units, decoded.shape[1])).astype(np.float32)
 
 
 def _times(levels: IntArray, steps: FloatArray | float) -> FloatArray:

@@ -131,7 +131,7 @@ def code_harmonics(coder: Coder, classes: IntArray) -> Tensors:
 
 def code_others(coder: Coder, exact: Sequence[str] = ()) -> Tensors:
     """All other tensors: those of two and more axes are weights of networks, except ``exact``; vectors stay as they are."""
-    found = {}
+    tensors = {}
     for name in coder.left:
         if name.endswith("/steps"):
             continue
@@ -140,8 +140,8 @@ def code_others(coder: Coder, exact: Sequence[str] = ()) -> Tensors:
         else:
             weights = coder.has(f"{name}/steps")
         step = coder.precision.networks if weights else 0.0
-        found[name] = coder.matrix(name, "networks" if weights else "other", step)
-    return found
+        tensors[name] = coder.matrix(name, "networks" if weights else "other", step)
+    return tensors
 
 
 def bound(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
@@ -193,8 +193,8 @@ def reduced(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     splats["colors"] = coder.vectors("colors", "harmonics", step, scale=scale_of(classes))
     widths = {name: splats[name].shape[1] for name in SHAPES}
     units, scale = _units(coder, splats["log_scales"], widths), scale_of(classes, COARSEST_SHAPE)
-    found = coder.vectors("shapes", "differences", 1.0, scale=scale, units=units)
-    table = found.reshape(len(found), -1, units.shape[1]).swapaxes(0, 1)
+    differences = coder.vectors("shapes", "differences", 1.0, scale=scale, units=units)
+    table = differences.reshape(len(differences), -1, units.shape[1]).swapaxes(0, 1)
     parts = np.split(table, np.cumsum([*widths.values()])[:-1], axis=2)
     return {**tensors, **splats, **dict(zip(SHAPES.values(), parts)), **code_others(coder)}
 
@@ -240,8 +240,8 @@ def field(coder: Coder, head: HeadAsset, subject: Subject) -> Tensors:
     if coder.has("lines"):
         shape = coder.whole("lines/shape", lambda: np.array(coder.given("lines").shape), "lines")
         values = lambda: coder.given("lines").reshape(-1, shape[3])
-        found = coder.vectors("lines", "lines", values=values, weights=np.ones(shape[:3].prod()))
-        tensors["lines"] = found.reshape(shape)
+        samples = coder.vectors("lines", "lines", values=values, weights=np.ones(shape[:3].prod()))
+        tensors["lines"] = samples.reshape(shape)
     return tensors | code_others(coder, ("plane_box", "line_box", "jaw_bases"))
 
 
@@ -260,9 +260,9 @@ def _plane(coder: Coder, name: str, shares: FloatArray | None) -> FloatArray:
     classes = coder.whole(f"{name}/classes", numbers, "planes")
     used = classes > 0
     own, scale = None if shares is None else shares[used], scale_of(classes[used] - 1 + FINEST)
-    found = coder.vectors(name, "planes", scale=scale, values=lambda: coder.given(name)[used], weights=own)
-    plane = np.zeros((len(used), found.shape[1]), np.float32)
-    plane[used] = found
+    samples = coder.vectors(name, "planes", scale=scale, values=lambda: coder.given(name)[used], weights=own)
+    plane = np.zeros((len(used), samples.shape[1]), np.float32)
+    plane[used] = samples
     return plane
 
 
@@ -274,8 +274,8 @@ def _shares(coder: Coder, head: HeadAsset, subject: Subject, splats: FloatArray)
     positions = frames.positions(table[:, -1].to(torch.int64), table[:, : SPLAT_WIDTHS["means"]])
     ones = {name: torch.ones(len(given[name]), 1, requires_grad=True) for name in PLANES}
     # Weights are above 0, since every sample that is read is stored.
-    own = np.ones(len(splats)) if coder.source.weights is None else coder.source.weights
-    factor = torch.from_numpy(np.maximum(own / max(own.mean(), 1e-30), 1e-6)).to(positions)
+    weights = np.ones(len(splats)) if coder.source.weights is None else coder.source.weights
+    factor = torch.from_numpy(np.maximum(weights / max(weights.mean(), 1e-30), 1e-6)).to(positions)
     with torch.enable_grad():
         features = plane_features(ones, Bounds(*torch.from_numpy(given["plane_box"])), positions)
         total = torch.stack([(part[:, 0] * factor).sum() for part in features]).sum()

@@ -1,4 +1,8 @@
-"""Bakes splat avatars of any method for a web page by sampling their splats in chosen poses."""
+"""Bakes splat avatars of any method for a web page by sampling their splats in chosen poses.
+
+The avatar of a page has splats, linear morphs, skinning by a few joints, and harmonics. All values are in the head's frame, metres:
+the root joint does not rotate, x points to the head's left, y up, z to the front.
+"""
 
 from __future__ import annotations
 
@@ -177,17 +181,17 @@ class Source:
 
     def seen(self, pose: HeadPose, camera: Camera | None = None) -> Seen:
         """The splats of a pose with their colours for a camera in the head's frame."""
-        found = self.avatar.splats(pose, None if camera is None else self.camera(camera))
+        splats = self.avatar.splats(pose, None if camera is None else self.camera(camera))
         rotation = self.rotation
-        means = (found.means - self.root - self.rest.translation) @ rotation + self.root
-        quats = torch.from_numpy(np.asarray(found.quats, np.float64))
-        opacities = np.asarray(found.opacities, np.float64).clip(1e-6, 1 - 1e-6)
+        means = (splats.means - self.root - self.rest.translation) @ rotation + self.root
+        quats = torch.from_numpy(np.asarray(splats.quats, np.float64))
+        opacities = np.asarray(splats.opacities, np.float64).clip(1e-6, 1 - 1e-6)
         return Seen(
             np.asarray(means, np.float64),
             rotation.T @ rotation_matrices(quats).numpy(),
-            np.log(np.maximum(np.asarray(found.scales, np.float64), 1e-8)),
+            np.log(np.maximum(np.asarray(splats.scales, np.float64), 1e-8)),
             np.log(opacities / (1 - opacities)).clip(-LOGIT_MAX, LOGIT_MAX),
-            None if found.colors is None else np.asarray(found.colors, np.float64),
+            None if splats.colors is None else np.asarray(splats.colors, np.float64),
         )
 
     @property
@@ -231,9 +235,9 @@ def bake(
 
 
 def _colors(source: Source, pose: HeadPose, camera: Camera) -> FloatArray:
-    found = source.seen(pose, camera).colors
-    assert found is not None  # the camera is given
-    return found
+    colors = source.seen(pose, camera).colors
+    assert colors is not None  # the camera is given
+    return colors
 
 
 def _weights(source: Source, rest: Seen) -> FloatArray:

@@ -196,15 +196,15 @@ class Recorded:
 
 def recorded_sequences(clip: Clip, version: str) -> list[Recorded]:
     """The sequences of a capture in order, those held out last; none if it was tracked with another head model."""
-    found: dict[tuple[str, str], dict[int, HeadPose]] = {}
+    sequences: dict[tuple[str, str], dict[int, HeadPose]] = {}
     for split, remark in SEQUENCES.items():
         for key in sorted(clip.splits.get(split, ())):
             pose = clip.poses[key.timestep]
             if pose.head_model == version:
-                found.setdefault((key.sequence, remark), {})[key.timestep] = pose
+                sequences.setdefault((key.sequence, remark), {})[key.timestep] = pose
     return [
         Recorded(*name, [poses[timestep] for timestep in sorted(poses)][:MOST_TIMESTEPS])
-        for name, poses in found.items()
+        for name, poses in sequences.items()
     ]
 
 
@@ -278,12 +278,12 @@ def _hidden(head: HeadArrays, chosen: Sequence[Slider], poses: Sequence[HeadPose
     left = wanted - _fitted(root, directions, wanted) @ directions
     _, sizes, axes = np.linalg.svd(left @ root.T, full_matrices=False)
     rms = np.sqrt(np.cumsum(sizes[::-1] ** 2)[::-1] / len(poses))  # residual before each direction
-    found = []
+    hidden = []
     for axis in axes[: min(MOST_HIDDEN, int((rms > STILL_M).sum()))]:
         direction = np.linalg.lstsq(root, axis, rcond=1e-6)[0]
         far = float(np.abs(left @ root.T @ axis).max())
-        found.append(_expression("", far * direction, -1.0, 1.0))
-    return found
+        hidden.append(_expression("", far * direction, -1.0, 1.0))
+    return hidden
 
 
 def _turn(poses: Sequence[HeadPose], joint: int) -> FloatArray:
@@ -348,13 +348,13 @@ def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) 
         losses["recorded"] = recorded_loss(source, read, view, chosen, slider_values(head, sliders, chosen))
     size = out.stat().st_size
     worst = min(losses, key=lambda name: losses[name])
-    shown = [slider.name for slider in sliders if slider.name]
-    text = f"{out}: {len(baked.means)} splats, {len(shown)} sliders, {len(sequences)} recorded sequences, {size / 1e6:.2f} MB; "
+    names = [slider.name for slider in sliders if slider.name]
+    text = f"{out}: {len(baked.means)} splats, {len(names)} sliders, {len(sequences)} recorded sequences, {size / 1e6:.2f} MB; "
     text += "PSNR against headbench's renderer: "
     text += ", ".join(f"{name} {value:.1f}" for name, value in losses.items()) + f" dB; minimum: {worst}"
     if settings.capture is not None and not sequences:
         text += f"\nThe capture was tracked with another head model than {head.version}; the page has no sequences to play."
-    data = {"out": out, "splats": len(baked.means), "bytes": size, "psnr": losses, "sliders": shown}
+    data = {"out": out, "splats": len(baked.means), "bytes": size, "psnr": losses, "sliders": names}
     return CommandResult(text, data | {"sequences": [sequence.name for sequence in sequences]})
 
 
@@ -376,10 +376,10 @@ def pictures(source: Source, sliders: Sequence[Slider], view: Mapping[str, Any])
     """A small picture of the face at the upper end of each slider of an expression, as data URIs; "" for others."""
     center = np.array(view["target"]) + [0.0, PICTURE_UP * view["distance"], 0.0]
     camera = orbit_camera(direction_of(0.0, 0.0), PICTURE_NEAR * view["distance"], center, PICTURE_PX)
-    found = []
+    uris = []
     for slider in sliders:
         if slider.joints or not slider.name:
-            found.append("")
+            uris.append("")
             continue
         pose = source.pose([slider], [slider.high])
         image = quantise(source.avatar.render(source.camera(camera), pose).rgb)
@@ -387,8 +387,8 @@ def pictures(source: Source, sliders: Sequence[Slider], view: Mapping[str, Any])
             cv2.resize(image, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA), np.uint8
         )
         encoded = encode_image(small, ".webp", (cv2.IMWRITE_WEBP_QUALITY, 80), place="a page")
-        found.append(f"data:image/webp;base64,{base64.b64encode(encoded).decode()}")
-    return found
+        uris.append(f"data:image/webp;base64,{base64.b64encode(encoded).decode()}")
+    return uris
 
 
 def fill_page(content: bytes, title: str) -> str:
@@ -396,8 +396,8 @@ def fill_page(content: bytes, title: str) -> str:
     from jinja2 import Environment, FileSystemLoader
 
     here = Path(__file__).parent
-    script, own = ((here / name).read_text(encoding="utf-8") for name in ("page.js", "page.css"))
-    style = stylesheet() + own
+    script, page_style = ((here / name).read_text(encoding="utf-8") for name in ("page.js", "page.css"))
+    style = stylesheet() + page_style
     allowed = f"script-src '{policy_hash(script)}'; style-src '{policy_hash(style)}'"
     environment = Environment(autoescape=True, loader=FileSystemLoader(here))
     return environment.get_template("page.html").render(

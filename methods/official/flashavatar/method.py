@@ -1,6 +1,11 @@
 """FlashAvatar by its authors' code.
 
 Xiang et al., "FlashAvatar: High-fidelity Head Avatar with Efficient Gaussian Embedding", CVPR 2024.
+
+Of an identity NAME, the loader reads ``metrical-tracker/output/NAME/checkpoint/00000.frame``, numbered from 0, and
+``dataset/NAME/imgs/00001.jpg``, ``alpha/00001.jpg``, ``parsing/00001_neckhead.png`` and ``parsing/00001_mouth.png``, whose numbers are
+one higher. Images are PNG under these names; the loader recognises the format by the content. It takes identity, image size and
+focal lengths from frame 0, and the principal point to be the middle of the image.
 """
 
 from __future__ import annotations
@@ -216,22 +221,22 @@ class ParsingMasks:
 
     def of(self, pose: HeadPose, camera: Camera, coverage: ByteArray) -> tuple[ByteArray, ByteArray]:
         """(H, W) masks of head with neck, and of the mouth, 0 or 255, for a camera in the head's frame."""
-        found = self._mesh.seen(pose, camera, coverage)
+        surface = self._mesh.seen(pose, camera, coverage)
         if self._native:
-            hull = mouth_mask(camera, found.vertices[self._lips], found.vertices.mean(0))
+            hull = mouth_mask(camera, surface.vertices[self._lips], surface.vertices.mean(0))
             return FULL * (coverage > 0).astype(np.uint8), FULL * hull.astype(np.uint8)
-        triangles = found.triangles.clip(0)
+        triangles = surface.triangles.clip(0)
         head, mouth = (np.zeros(coverage.shape, np.uint8) for _ in range(2))
-        mouth[found.rows, found.columns] = FULL * (found.hit & self._mouth[triangles])
-        inside_head = found.hit & ~self._below[triangles]
-        beside = np.flatnonzero(~found.hit)
+        mouth[surface.rows, surface.columns] = FULL * (surface.hit & self._mouth[triangles])
+        inside_head = surface.hit & ~self._below[triangles]
+        beside = np.flatnonzero(~surface.hit)
         if len(beside):
             world = np.asarray(camera.world_to_camera, np.float64)
-            points = (found.vertices @ world[:3, :3].T + world[:3, 3]) @ np.asarray(camera.K, np.float64).T
-            pixels = np.stack([found.columns[beside], found.rows[beside]], axis=1) + 0.5
+            points = (surface.vertices @ world[:3, :3].T + world[:3, 3]) @ np.asarray(camera.K, np.float64).T
+            pixels = np.stack([surface.columns[beside], surface.rows[beside]], axis=1) + 0.5
             _, nearest = KDTree(points[:, :2] / points[:, 2:]).query(pixels)
             inside_head[beside] = ~self._on_boundary[nearest]
-        head[found.rows, found.columns] = FULL * inside_head
+        head[surface.rows, surface.columns] = FULL * inside_head
         return head, mouth
 
 
@@ -267,7 +272,7 @@ def write_training(
 def write_list(frames: Sequence[Listed], subject: FlameSubject, name: str, work: Workplace) -> None:
     """Write frames of one camera's intrinsics as an identity, in windows around their images.
 
-    Images are marks, see `..ga.export.mark`; the renderer writes each beside the render. Masks have one pixel.
+    Images are marks, see `..ga.method.mark`; the renderer writes each beside the render. Masks have one pixel.
     """
     white, black = np.full((1, 1), FULL, np.uint8), np.zeros((1, 1), np.uint8)
     for index, frame in enumerate(at_rest(subject.posed, frames)):

@@ -206,10 +206,10 @@ class OfficialHead:
     @classmethod
     def of(cls, head: HeadAsset, checkout: Path) -> OfficialHead:
         """Convert a clip's head model for their code."""
-        own = cls.numbered(head)
-        if _same_faces(own.faces, checkout / TEMPLATE_FILE):
-            return own  # FLAME's own topology: their indices are valid
-        return own._with_lips(_their_rings(checkout), f"head model {head.version!r}")
+        official = cls.numbered(head)
+        if _same_faces(official.faces, checkout / TEMPLATE_FILE):
+            return official  # FLAME's own topology: their indices are valid
+        return official._with_lips(_their_rings(checkout), f"head model {head.version!r}")
 
     @classmethod
     def numbered(cls, head: HeadAsset) -> OfficialHead:

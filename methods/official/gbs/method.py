@@ -182,7 +182,7 @@ def write_training(
 
 
 def write_list(frames: Sequence[Listed], head: VideoHead, work: Workplace) -> None:
-    """Write frames to render as a video whose images are marks, see `..ga.export.mark`.
+    """Write frames to render as a video whose images are marks, see `..ga.method.mark`.
 
     Their renderer first fills two look-up grids of 256^3 nodes, which takes minutes, although it reads the required
     values from the checkpoint. Grids of one node in its cache files avoid that.

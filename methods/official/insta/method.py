@@ -2,6 +2,10 @@
 
 Zielonka, Bolkart, Thies, "Instant Volumetric Head Avatars", CVPR 2023. Their program is C++ and CUDA, built on
 instant-ngp. It takes a scene and a configuration, trains, records the frames of the scene's test split, and ends.
+
+The program reads the format of Metrical Tracker with ``generate.sh``: ``transforms_train.json`` (camera-to-world with OpenCV's axes,
+metres; intrinsics of each frame), ``images`` with straight alpha, ``meshes``, ``flame/exp``, ``depth`` (16 bits, millimetres),
+``seg_mask`` (a class in the red channel), ``canonical.obj``; and ``mesh_masks``, which it opens relative to its working directory.
 """
 
 from __future__ import annotations
@@ -227,14 +231,14 @@ class _Surfaces:
 
         Covered pixels beside the mesh are hair.
         """
-        found = self._mesh.seen(pose, camera, coverage)
+        surface = self._mesh.seen(pose, camera, coverage)
         classes = np.zeros((*coverage.shape, 3), np.uint8)
-        classes[found.rows, found.columns, 0] = np.where(
-            found.hit, self._classes[found.triangles.clip(0)], HAIR
+        classes[surface.rows, surface.columns, 0] = np.where(
+            surface.hit, self._classes[surface.triangles.clip(0)], HAIR
         )
         depth = np.zeros(coverage.shape, np.uint16)
-        millimetres = np.rint(np.where(found.hit, MILLIMETRES * found.depths, 0))
-        depth[found.rows, found.columns] = millimetres.clip(0, FARTHEST)
+        millimetres = np.rint(np.where(surface.hit, MILLIMETRES * surface.depths, 0))
+        depth[surface.rows, surface.columns] = millimetres.clip(0, FARTHEST)
         return classes, depth
 
 

@@ -391,15 +391,15 @@ def _make_capture(settings: ParitySettings, out: Path, progress: Progress) -> No
 
 def _cells(run_folder: RunFolder, rows: Rows, method: str, orders: Sequence[int]) -> list[dict[str, Any]]:
     """Splats and changes of every avatar of a method."""
-    found = []
+    cells = []
     for subject in sorted(rows.subjects):
         for order in orders:
             folder = run_folder.cell(subject, method, order).avatar
             path = folder / TRAINING_FILE
             record = read_json(path) if path.exists() else {}
             entry = {"subject": subject, "order": order, "splats": record.get("splats") or _splats(folder)}
-            found.append({**entry, "differences": record.get("differences", [])})
-    return found
+            cells.append({**entry, "differences": record.get("differences", [])})
+    return cells
 
 
 def _splats(folder: Path) -> int | None:
@@ -479,9 +479,9 @@ def _table(differences: Sequence[Difference], native: str, official: str, *, mar
             where = {"task": each.task.replace("_", " "), "metric": titles[each.metric]}
             where |= {"subject": str(subject), "order": str(order)}
             values = {native: f"{a:.{digits}f}", official: f"{b:.{digits}f}"}
-            shown = f"{difference:+.{digits}f}{interval}"
-            shown = f"**{shown}**" if markdown and order == "all" else shown
-            rows.append({**where, **values, "difference": shown})
+            text = f"{difference:+.{digits}f}{interval}"
+            text = f"**{text}**" if markdown and order == "all" else text
+            rows.append({**where, **values, "difference": text})
     if not markdown:
         return aligned(rows)
     names = ["task", "metric", "subject", "order", native, official, "difference"]

@@ -73,14 +73,14 @@ def flame_subject(subject: Subject, head: HeadAsset, checkout: Checkout, *, own_
         chart_of(head)
         return FlameSubject.whole(head, subject)
     lid = EYELID_FILES[0]
-    found = FlameSubject.of(head, subject, len(read_npy(checkout.folder / lid)), lid)
+    flame = FlameSubject.of(head, subject, len(read_npy(checkout.folder / lid)), lid)
     chart = read_npz(checkout.folder / CHART_FILE)
     triangles = np.asarray(chart.get("ft", ()))
-    if triangles.shape != found.official.faces.shape:
+    if triangles.shape != flame.official.faces.shape:
         expected = f"{len(triangles)} triangles, as {CHART_FILE} has"
-        count = str(len(found.official.faces))
+        count = str(len(flame.official.faces))
         raise InputError(f"head model {head.version!r}", "faces", expected, count)
-    return found
+    return flame
 
 
 def write_program(identity: Subject, head: HeadAsset, work: Workplace, *, own_chart: bool) -> FlameSubject:

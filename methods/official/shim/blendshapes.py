@@ -125,10 +125,10 @@ def read_obj(path: str) -> ObjFile:
 
 def load_obj(path: str, load_textures: bool = False) -> tuple[Tensor, Faces, Auxiliary]:
     """Vertices (V, 3), triangles and texture coordinates of an OBJ file; materials are not read."""
-    found = read_obj(path)
-    uv = torch.from_numpy(found.uv).float() if len(found.uv) else None
-    faces = Faces(torch.from_numpy(found.faces), torch.from_numpy(found.uv_faces))
-    return torch.from_numpy(found.vertices).float(), faces, Auxiliary(uv)
+    mesh = read_obj(path)
+    uv = torch.from_numpy(mesh.uv).float() if len(mesh.uv) else None
+    faces = Faces(torch.from_numpy(mesh.faces), torch.from_numpy(mesh.uv_faces))
+    return torch.from_numpy(mesh.vertices).float(), faces, Auxiliary(uv)
 
 
 # ---------------------------------------------------------------------- rasterisation of a mesh
@@ -358,9 +358,9 @@ def nearest_features(
     vertices: Tensor, features: Tensor, faces: Tensor, points: Tensor, candidates: int
 ) -> Tensor:
     """(M, C) vertex features (V, C), interpolated at the points of the surface nearest to (M, 3) points."""
-    found = _nearest(vertices, faces, points)
-    corners = faces.long()[torch.from_numpy(found.triangles)]
-    weights = torch.from_numpy(found.weights).to(features)
+    nearest = _nearest(vertices, faces, points)
+    corners = faces.long()[torch.from_numpy(nearest.triangles)]
+    weights = torch.from_numpy(nearest.weights).to(features)
     summed = torch.zeros(len(points), features.shape[1])
     for corner in range(3):
         summed += weights[:, corner, None] * features[corners[:, corner]]
@@ -411,8 +411,8 @@ class SoftPhongShader(Attributes):
 
 def load_mesh(path: str) -> tuple[np.ndarray, np.ndarray]:
     """(V, 3) vertices and (F, 3) triangles of an OBJ file."""
-    found = read_obj(path)
-    return found.vertices, found.faces
+    mesh = read_obj(path)
+    return mesh.vertices, mesh.faces
 
 
 def sample_mesh_poisson_disk(
@@ -422,8 +422,8 @@ def sample_mesh_poisson_disk(
 
     Coordinates have the dtype of the vertices.
     """
-    found = poisson_disk(vertices, faces, np.arange(len(faces)), count, 0)
-    return found.triangles, found.barycentric.astype(vertices.dtype)
+    points = poisson_disk(vertices, faces, np.arange(len(faces)), count, 0)
+    return points.triangles, points.barycentric.astype(vertices.dtype)
 
 
 RASTERIZER: dict[str, Any] = {

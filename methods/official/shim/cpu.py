@@ -225,8 +225,8 @@ def rasterize_chart(
     # PyTorch3D's coordinates, which `rasterize_meshes` takes, point the other way along both sides.
     turned = torch.cat([-pos[..., :2], pos[..., 2:3]], dim=-1)
     triangles, z, barycentric, _ = rasterize_meshes(Mesh(turned, tri[None].long()), resolution[0])
-    found = torch.cat([barycentric[..., 0, :2], z, triangles + 1.0], dim=-1)
-    return found * (triangles >= 0), None
+    fragments = torch.cat([barycentric[..., 0, :2], z, triangles + 1.0], dim=-1)
+    return fragments * (triangles >= 0), None
 
 
 RASTERIZER: dict[str, Any] = {
@@ -257,8 +257,8 @@ def install(threads: int, code: str) -> None:
     optionally must stay missing, so stand-ins are limited to the required ones.
     """
     torch.set_num_threads(threads)
-    own = RASTERIZER if code == "blended splats" else {}
-    _module("diff_gaussian_rasterization", PUBLIC | blendshapes.RASTERIZER | own)
+    extra = RASTERIZER if code == "blended splats" else {}
+    _module("diff_gaussian_rasterization", PUBLIC | blendshapes.RASTERIZER | extra)
     _module("diff_gaussian_rasterization._C", blendshapes.RASTERIZER_KERNELS)
     _module("simple_knn")
     _module("simple_knn._C", {"distCUDA2": mean_square_distances, **blendshapes.NEIGHBOURS})
@@ -290,8 +290,8 @@ def install(threads: int, code: str) -> None:
 
 def mean_square_distances(points: Tensor) -> Tensor:
     """(N,) mean of the squared distances from each of (N, 3) points to its three nearest neighbours."""
-    found, _ = KDTree(points.detach().numpy()).query(points.detach().numpy(), k=4)
-    return torch.from_numpy(np.square(found[:, 1:]).mean(axis=1)).to(points.dtype)
+    distances, _ = KDTree(points.detach().numpy()).query(points.detach().numpy(), k=4)
+    return torch.from_numpy(np.square(distances[:, 1:]).mean(axis=1)).to(points.dtype)
 
 
 def _is_installed(name: str) -> bool:
@@ -299,9 +299,9 @@ def _is_installed(name: str) -> bool:
     package = name.partition(".")[0]
     if package == "torch":  # replaced by a module that imports another package
         package = name.rpartition(".")[2]
-    known = sys.modules.get(package)
-    if known is not None:
-        return known.__spec__ is not None
+    module = sys.modules.get(package)
+    if module is not None:
+        return module.__spec__ is not None
     return importlib.util.find_spec(package) is not None
 
 

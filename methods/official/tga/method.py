@@ -109,10 +109,10 @@ class TGAOfficial(GALayoutMethod[TGAOfficialConfig]):
         return self._sizes_of(read_shared_head(folder), checkout)
 
     def _sizes_of(self, head: HeadAsset, checkout: Checkout) -> list[Patch]:
-        fixed, found = _fixed_sizes(checkout), _sizes(OfficialHead.of(head, checkout.folder))
+        fixed, sizes = _fixed_sizes(checkout), _sizes(OfficialHead.of(head, checkout.folder))
         return [
             (_MODEL_SOURCE, f"torch.zeros([T, {theirs}, ", f"torch.zeros([T, {ours}, ")
-            for theirs, ours in zip(fixed, found)
+            for theirs, ours in zip(fixed, sizes)
             if theirs != ours
         ]
 

@@ -4,6 +4,7 @@ import shutil
 import sys
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from headbench.bench.errors import HeadbenchError, InputError, UnavailableError
 from headbench.bench.io.documents import read_json
 from headbench.bench.process import ProgramError
 from headbench.datasets.head.model import PosedSubject, pose_in_head_frame
-from headbench.methods.official import needs
+from headbench.methods.official import needs, workplace
 from headbench.methods.official.checkout import Repository, inspect_checkout
 from headbench.methods.official.flashavatar import method as flashavatar
 from headbench.methods.official.gha.method import GHATracking
@@ -24,13 +25,52 @@ from headbench.methods.official.insta import method as insta
 from headbench.methods.official.method import RENDERING, RENDERING_LOG, TRAINING, TRAINING_LOG
 from headbench.methods.official.rgbavatar import method as rgbavatar
 from headbench.methods.official.spec import GAOfficialConfig
-from headbench.methods.official.workplace import check_export
+from headbench.methods.official.workplace import check_export, gaussian_blendshapes
 from headbench.methods.shared.avatar_files import Subject
 from headbench.methods.shared.schedule import ShuffledEpochs
 
 from .conftest import OF_VIDEO
 from .helpers import BUDGET, WHITE, export, fit, rendered, renders, views
 from .repository import ADAPTERS
+
+
+def test_gaussianblendshapes_numbers_the_last_350_frames(tmp_path):
+    keys = [FrameKey("s", "video", timestep, "0") for timestep in range(400)]
+    clip = SimpleNamespace(subject="s", splits={"train": keys[:50]}, excluded=dict.fromkeys(keys[50:], "why"))
+    for name, count in (("test", 350), ("seq", 400)):
+        made = tmp_path / name / "split_40000"
+        made.mkdir(parents=True)
+        for index in range(count):
+            (made / f"pred_{index:05d}.png").touch()
+        found = gaussian_blendshapes(tmp_path, clip, {})
+        assert {render.truth.name for render in found.values()} >= {"gt_00000.png"}
+        for key in keys[-count:]:
+            index = key.timestep - (400 - count) if name == "test" else key.timestep
+            assert found[key].image.name == f"pred_{index:05d}.png" or name == "seq"
+        assert len(found) == count
+    (tmp_path / "seq/split_40000/pred_00399.png").unlink()
+    with pytest.raises(InputError, match="400 images.*found 399"):
+        gaussian_blendshapes(tmp_path, clip, {})
+
+
+def test_insta_numbers_the_frames_that_are_held_out(tmp_path):
+    parts = ("video",) * 4 + ("video-held-out",) * 3
+    keys = [FrameKey("s", sequence, timestep, "0") for timestep, sequence in enumerate(parts)]
+    splits = {"train": keys[:3], "self_reenactment": keys[4:6]}
+    clip = SimpleNamespace(subject="s", splits=splits, excluded={keys[3]: "why", keys[6]: "why"})
+    (tmp_path / "overlay").mkdir()
+    for index in range(3):
+        (tmp_path / "overlay" / f"{index:05d}.png").touch()
+    found = workplace.insta(tmp_path, clip, {})
+    assert {key: render.image.name for key, render in found.items()} == {
+        key: f"{index:05d}.png" for index, key in enumerate(keys[4:])
+    }
+    (tmp_path / "overlay/00002.png").unlink()
+    with pytest.raises(InputError, match="3 images.*transforms_test.json, found 2"):
+        workplace.insta(tmp_path, clip, {})
+    with pytest.raises(InputError, match="expected overlay, as the program leaves it"):
+        workplace.insta(tmp_path / "overlay", clip, {})
+
 
 NAME = "ga"
 

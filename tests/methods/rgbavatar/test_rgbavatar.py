@@ -1,11 +1,13 @@
 """RGBAvatar's own part: blendshapes, their weights, splats on a moving surface, colours from images, batches."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from scipy.stats import chisquare
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
@@ -13,7 +15,7 @@ from headbench.datasets.head.rotations import axis_angle_to_matrix
 from headbench.methods.avatars.compact.codecs import parts_of, write_coded
 from headbench.methods.avatars.settings import EXACT
 from headbench.methods.ops.planes import C0
-from headbench.methods.rgbavatar.method import RGBAvatar, RGBAvatarTraining
+from headbench.methods.rgbavatar.method import GLOBAL, LOCAL, OnlineBatches, RGBAvatar, RGBAvatarTraining
 from headbench.methods.rgbavatar.model import SHAPES, StoredShapes, blend_weights, blended, seen_colors
 from headbench.methods.rgbavatar.spec import INPUTS, RGBAvatarConfig
 from headbench.methods.shared.avatar_files import AVATAR_FILE
@@ -23,11 +25,73 @@ from headbench.methods.shared.surface_points import SubjectMesh, point_tensors, 
 from headbench.methods.shared.tensor_files import read_safetensors, write_tensors
 from headbench.methods.splats import pixel_weights, rasterize
 
-SMALL = {"samples": 400, "hidden": 8, "blendshapes": 3, "schedule_length": 40, "join": 4}
+from .small import SMALL
+
+
+def test_no_image_is_drawn_before_it_arrives_or_twice_in_a_batch():
+    batches = OnlineBatches(range(3_000), 10, 25, seed=0)
+    for iteration in (1, 2, 3, 50, 400, 2_000, 20_000):
+        batch, arrived = batches.batch(iteration), min(3_000, 10 + (iteration - 1) * 10 // 25)
+        assert batches.arrived(iteration) == arrived
+        assert len(set(batch)) == len(batch) == 10
+        assert max(batch) < arrived
+
+
+def test_a_batch_depends_on_its_number_alone():
+    one, other = (OnlineBatches(range(3_000), 10, 5, seed=0) for _ in range(2))
+    numbers = [1_400, 3, 700, 1_400, 90]
+    found = {number: one.batch(number) for number in sorted(set(numbers))}
+    assert [other.batch(number) for number in numbers] == [found[number] for number in numbers]
+
+
+@pytest.mark.parametrize(("arrived", "share"), [(150, 0.0), (450, 0.7 * 300 / 599), (749, 0.7), (2_000, 0.7)])
+def test_the_share_of_older_images_rises_to_its_maximum(arrived, share):
+    batches = OnlineBatches(range(arrived), 10, 1, seed=0)
+    draws = [image for iteration in range(arrived, arrived + 400) for image in batches.batch(iteration)]
+    older = np.mean(np.array(draws) < arrived - LOCAL)
+    assert older == pytest.approx(share, abs=0.04)
+
+
+def test_newer_ones_of_the_newest_are_more_probable():
+    batches = OnlineBatches(range(LOCAL), 1, 1, seed=0)
+    draws = Counter(batches.batch(iteration)[0] for iteration in range(LOCAL, LOCAL + 6_000))
+    weights = np.exp(np.arange(LOCAL) / LOCAL)
+    expected = 6_000 * weights / weights.sum()
+    assert chisquare([draws[image] for image in range(LOCAL)], expected).pvalue > 1e-3
+
+
+def test_the_kept_ones_are_a_uniform_sample():
+    """Kept shares of the first, second and last third of the older images, over seeds."""
+    count, kept = 3_000, np.zeros(3)
+    for seed in range(20):
+        places = np.array(OnlineBatches(range(count), 10, 1, seed=seed)._older(count))
+        assert len(set(places.tolist())) == GLOBAL
+        kept += np.bincount(places * 3 // count, minlength=3)
+    assert chisquare(kept).pvalue > 1e-3
+
+
+def test_the_first_batches_have_what_is_there():
+    assert sorted(OnlineBatches((4, 2, 0), 10, 25, seed=0).batch(1)) == [0, 2, 4]
+
+
+def test_timesteps_arrive_in_order(clip):
+    config = RGBAvatarConfig(**{**SMALL, "online": True, "together": 1, "batch": 2, "join": 20})
+    training = RGBAvatarTraining(clip, config, "cpu", 0)
+    training.begin(Timeline(24, 24))
+    assert {training.keys[image].timestep for image in training._batches.batch(1)} == {0}
+    training.loss(1, 0).backward()
+    assert training.optimiser["color_shapes"].grad is not None
+    assert len(training.result().points.triangles) == len(training.colored)  # none is removed
+    training.close()
+    with pytest.raises(ValueError, match="together"):
+        replace(config, together=2)
+
+
+TINY = {"samples": 400, "hidden": 8, "blendshapes": 3, "schedule_length": 40, "join": 4}
 
 
 def make(clip, **settings):
-    training = RGBAvatarTraining(clip, RGBAvatarConfig(**{**SMALL, **settings}), "cpu", 0)
+    training = RGBAvatarTraining(clip, RGBAvatarConfig(**{**TINY, **settings}), "cpu", 0)
     training.begin(Timeline(40, 40))
     return training
 
@@ -151,7 +215,7 @@ def test_axes_along_a_chart_need_one(clip):
 def test_files_tell_the_axes_of_their_splats(clip, tmp_path):
     """An avatar and its coded file are drawn with the axes of the training."""
     clip = replace(clip, head=charted(clip.head))
-    method = RGBAvatar(RGBAvatarConfig(**{**SMALL, "frame_variant": "official"}))
+    method = RGBAvatar(RGBAvatarConfig(**{**TINY, "frame_variant": "official"}))
     avatar = method.fit(clip, tmp_path, Budget(8), device="cpu", seed=0, progress=no_progress)
     assert avatar.stored.text().endswith("translation;frame_variant=official")
     coded = tmp_path / "coded"
