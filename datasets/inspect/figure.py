@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 
 import cv2
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
 from matplotlib.figure import SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
@@ -19,7 +22,8 @@ from ..clip import CaptureClip
 from ..figures import HELD_OUT, MUTED, TRAIN, bands, hexadecimal, new_figure, shortened, show
 from ..head.geometry import rigid_alignment
 from ..head.model import PosedSubject
-from ..mesh_pictures import draw_mesh, rasterize_mesh
+from ..head.refit.refit import Refitted
+from ..mesh_pictures import CLAY, draw_mesh, portrait_camera, rasterize_mesh
 from .statistics import KEPT_VARIANCE, ExpressionSpace, SequenceRow, SplitRow
 
 
@@ -407,3 +411,33 @@ def space_summary(space: ExpressionSpace) -> str:
             f"test faces lie {np.median(new):.2f} mm (median; most {new.max():.2f}) from the nearest of them"
         )
     return "; ".join(parts)
+
+
+_YAWS = (-0.75, 0.0, 0.75)
+_VIEW = (560, 720)
+_SHOWN = 99  # percentile of the residuals at the upper end of the scale
+
+
+def draw_heat_map(refitted: Refitted) -> ByteArray:
+    """(H, W, 3) image of the head from three sides with a scale; vertices that were not fitted are grey."""
+    clip, report = refitted.clip, refitted.report
+    neutral = PosedSubject.of(clip).neutral
+    fitted = np.isfinite(report.vertex_mm)
+    top = max(float(np.percentile(report.vertex_mm[fitted], _SHOWN)), 1e-3)
+    colours = np.tile(np.array(CLAY), (len(neutral), 1))
+    colours[fitted] = matplotlib.colormaps["viridis"](np.clip(report.vertex_mm[fitted] / top, 0, 1))[:, :3]
+    summary = report.summary()
+    with new_figure(8.8, 5) as figure:
+        figure.suptitle(
+            f"Refit of {clip.subject}: {summary['source']} to {summary['target']}\n"
+            f"mean over {summary['timesteps']} timesteps; face: mean {summary['mean_mm']:.3f} mm, "
+            f"95th percentile {summary['p95_mm']:.3f} mm"
+        )
+        grid = figure.subplots(1, len(_YAWS))
+        for axes, yaw in zip(grid, _YAWS):
+            camera = portrait_camera(neutral, *_VIEW, yaw=yaw)
+            picture = draw_mesh(neutral, clip.head.faces, camera, colours, shading=0.35, supersampling=1)
+            show(axes, picture)
+        scale = ScalarMappable(Normalize(0, top), "viridis")
+        figure.colorbar(scale, ax=grid, location="bottom", shrink=0.5, aspect=40, label="mm")
+        return pixels(figure)

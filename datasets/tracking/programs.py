@@ -18,8 +18,8 @@ from ...bench.io.documents import read_json
 from ...bench.io.files import check_output_folder, digest, digest_file, write_json
 from ...bench.process import described, environment, run_program
 from ...bench.specs import CommandResult, Need
+from ..ga.writer import link_or_copy
 from ..head.refit.command import target_head
-from ..head.refit.rewrite import link_or_copy
 from ..monocular.clip import check_subject, subject_of
 from ..tracker_files.command import ImportTrackingSettings, import_tracking
 from ..video.decode import is_video, probe_video

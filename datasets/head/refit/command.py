@@ -33,9 +33,10 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     ``heat_map.png``.
     """
     from ...clip import check_apart
+    from ...ga.writer import capture_plan, write_capture
     from ...images import write_image
-    from .refit import draw_heat_map, refit
-    from .rewrite import capture_plan, write_capture
+    from ...inspect.figure import draw_heat_map
+    from .refit import refit
 
     out = Path(settings.out)
     target = target_head(settings.target)
