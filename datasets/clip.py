@@ -259,9 +259,9 @@ class CaptureClip:
 
     def _processed(self, key: FrameKey, part: Literal["image", "mask"]) -> ByteArray:
         """Image or mask of a frame after all pixel steps, read-only; both are cached because they are computed together."""
-        found = self.store.find((self.fingerprint, key, part))
-        if found is not None:
-            return found
+        cached = self.store.find((self.fingerprint, key, part))
+        if cached is not None:
+            return cached
         files = self._files(key)
         ground = self.background if self.read_background is None else self.read_background
         if files.image is None:

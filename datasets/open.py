@@ -81,9 +81,9 @@ def _folder(path: Path) -> Foreign:
     if not names:
         return Foreign("an empty folder", "")
     for recognise in (_run, _captures_below, _nersemble, _tracked, _cameras_only, _unprepared, _nested):
-        found = recognise(path, names)
-        if found is not None:
-            return found
+        layout = recognise(path, names)
+        if layout is not None:
+            return layout
     some = ", ".join(name[:40] for name in names[:5])
     return Foreign(some + (", ..." if len(names) > 5 else ""), "")
 
@@ -248,8 +248,8 @@ def open_clips(
 def open_clip(path: str | PathLike[str], reader: str = "", **options: Any) -> CaptureClip:
     """Read the one capture at ``path``; parameters and errors as of `open_clips`."""
     spec = find_reader(path, reader)
-    found = resolve(spec.find)(Path(path)) if spec.find else [Path(path)]
-    if len(found) > 1:
-        names = ", ".join(Path(one).name for one in found)
+    captures = resolve(spec.find)(Path(path)) if spec.find else [Path(path)]
+    if len(captures) > 1:
+        names = ", ".join(Path(one).name for one in captures)
         raise InputError(path, "", "one capture", names, "Name one capture.")
     return next(open_clips(path, reader, **options))

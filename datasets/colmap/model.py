@@ -367,11 +367,11 @@ def read_model(path: str | PathLike[str]) -> ColmapModel:
 
 def _by_number(file: Path, kind: str, entries: Iterable[tuple[int, T]]) -> dict[int, T]:
     """Cameras or images by id, validated and unique."""
-    found: dict[int, T] = {}
+    items: dict[int, T] = {}
     for number, entry in entries:
         key = f"{kind} {number}"
-        if number in found:
+        if number in items:
             raise InputError(file, key, f"each {kind} once", "a second one")
         entry.check(file, key)
-        found[number] = entry
-    return found
+        items[number] = entry
+    return items

@@ -73,7 +73,7 @@ def model_cameras(
     "left to the images" gives the cameras of the undistorted images, which `undistort_clip` makes with `model_lenses`.
     """
     lenses = {number: _lens(model, number) for number in model.cameras}
-    found: dict[str, Camera] = {}
+    cameras: dict[str, Camera] = {}
     for number, image in sorted(model.images.items()):
         lens = lenses[image.camera]
         if lens.distorts and distortion == "refuse":
@@ -84,15 +84,15 @@ def model_cameras(
                 f"{lens.model} with parameters {', '.join(f'{value:g}' for value in lens.parameters)}",
                 "Undistort images and model together (`colmap image_undistorter`), or the clip by undistort_clip.",
             )
-        if image.name in found:
+        if image.name in cameras:
             expected = "image names that differ"
             raise InputError(model.folder, f"image {number}", expected, f"{image.name!r} again")
         world_to_camera = np.eye(4)
         w, x, y, z = image.quaternion
         world_to_camera[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
         world_to_camera[:3, 3] = image.translation
-        found[image.name] = Camera(image.name, lens.width, lens.height, lens.K, world_to_camera)
-    return found
+        cameras[image.name] = Camera(image.name, lens.width, lens.height, lens.K, world_to_camera)
+    return cameras
 
 
 def model_lenses(model: ColmapModel) -> dict[str, Lens]:

@@ -237,11 +237,11 @@ class DrivenMeasures:
         """(T,) smallest distances between the middle of the upper and the lower lip, millimetres; None for heads without lips."""
         if self._lips is None:
             return None
-        both, count, found = np.concatenate(self._lips), len(self._lips[0]), []
+        both, count, distances = np.concatenate(self._lips), len(self._lips[0]), []
         for mesh in self._meshes(poses, both):
             gaps = mesh[:count, None] - mesh[None, count:]
-            found.append(np.linalg.norm(gaps, axis=2).min())
-        return _MILLIMETRES * np.array(found)
+            distances.append(np.linalg.norm(gaps, axis=2).min())
+        return _MILLIMETRES * np.array(distances)
 
     def _meshes(self, poses: Sequence[HeadPose], vertices: IntArray) -> Iterator[FloatArray]:
         """(n, 3) vertices of each pose."""
@@ -306,11 +306,11 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
         regular, filled = resampled(request.path, signal.poses, signal.timing, fps)
         signal = replace(signal, poses=regular)
         window_length(len(signal.poses), settings.smooth, fps)
-        found = transfer(signal, scene.head, settings.neutral, progress)
-        moving = head_motion(found.poses, settings.still_head)
+        transferred = transfer(signal, scene.head, settings.neutral, progress)
+        moving = head_motion(transferred.poses, settings.still_head)
         driven = smoothed(moving, settings.smooth, fps)
         transfer_ms = 1e3 * (time.perf_counter() - start) / len(driven)
-        data = measured(settings, scene, signal, found, (moving, driven))
+        data = measured(settings, scene, signal, transferred, (moving, driven))
         data |= {"fps": fps, "interpolated": filled, "transfer_ms": round(transfer_ms, 2)}
         poses = dict(enumerate(scene.placed([*driven, canonical(scene.head)])))
         sequences = dict.fromkeys(poses, SEQUENCE) | {len(driven): REST}

@@ -118,14 +118,14 @@ def read_coefficients(request: SignalRequest) -> DrivingSignal:
     """Coefficients of each frame with a face. Identity is ignored."""
     table = request.columns
     head = request.head(DEFAULT_HEAD)
-    found = {part: next((n for n in names if n in table.columns), "") for part, names in NAMES.items()}
-    table = table.with_face([name for name in found.values() if name])
-    if not found["expression"]:
+    column_of = {part: next((n for n in names if n in table.columns), "") for part, names in NAMES.items()}
+    table = table.with_face([name for name in column_of.values() if name])
+    if not column_of["expression"]:
         expected = f"expression coefficients: {', '.join(NAMES['expression'])}"
         raise InputError(table.path, "", expected, ", ".join(sorted(table.columns)))
-    values = {part: table.values(name) for part, name in found.items() if name}
-    parts = _parts(table, values, found)
-    taken = {part: name for part, name in found.items() if name and _drives(part, parts, values)}
+    values = {part: table.values(name) for part, name in column_of.items() if name}
+    parts = _parts(table, values, column_of)
+    taken = {part: name for part, name in column_of.items() if name and _drives(part, parts, values)}
     used = {*taken.values()}
     unused = {
         name: "identity" if name in IDENTITY else "no coefficient of the pose"
@@ -133,7 +133,7 @@ def read_coefficients(request: SignalRequest) -> DrivingSignal:
         if name not in (*used, table.timing.column)
     }
     if "eyelids" in parts and head.eyelid_basis is None:
-        unused[found["eyelids"]] = NO_EYELIDS
+        unused[column_of["eyelids"]] = NO_EYELIDS
     return DrivingSignal("coefficients", head, make_poses(table.path, head, parts), table.timing, unused)
 
 

@@ -262,20 +262,22 @@ def is_embedded(head: HeadArrays) -> bool:
 
 def blendshape_parts(head: HeadArrays) -> dict[str, dict[str, FloatArray]]:
     """Effect of each blendshape at 1 on the parts of a pose, by name: expression (E,), jaw (3,), eyes (6,), eyelids (2,)."""
-    found: dict[str, dict[str, FloatArray]] = {name: _joint(weights) for name, weights in JOINTS.items()}
+    weights_by_shape: dict[str, dict[str, FloatArray]] = {
+        name: _joint(weights) for name, weights in JOINTS.items()
+    }
     if is_embedded(head):
-        return found | _embedded_parts(head.version)
+        return weights_by_shape | _embedded_parts(head.version)
     columns = _named_columns(head)
     if not columns:
         expected = "the embedded head, or one with expressions of ARKit's names such as ICT-FaceKit's"
         raise InputError("command line", "--signal-head", expected, head.version)
     for name, direction in columns.items():
         if name == "jawOpen":  # the shape replaces the joint
-            found.pop(name)
-        found.setdefault(name, {})["expression"] = direction
+            weights_by_shape.pop(name)
+        weights_by_shape.setdefault(name, {})["expression"] = direction
     if "jawLeft" in columns:
-        del found["jawLeft"]["jaw"], found["jawRight"]["jaw"]
-    return found
+        del weights_by_shape["jawLeft"]["jaw"], weights_by_shape["jawRight"]["jaw"]
+    return weights_by_shape
 
 
 @cache
@@ -287,14 +289,14 @@ def _embedded_head() -> HeadArrays:
 def _embedded_parts(version: str) -> dict[str, dict[str, FloatArray]]:
     """Parts of the shapes of a version of the embedded head."""
     matrix, lids = semantic_to_coefficients(version)
-    found = {}
+    rotations = {}
     for name, shapes in _EMBEDDED.items():
         rows = [SEMANTIC_NAMES.index(shape) for shape in shapes]
         weights = np.array([*shapes.values()])
-        found[name] = {"expression": weights @ matrix[rows]}
+        rotations[name] = {"expression": weights @ matrix[rows]}
         if lids is not None:
-            found[name]["eyelids"] = weights @ lids[rows]
-    return found
+            rotations[name]["eyelids"] = weights @ lids[rows]
+    return rotations
 
 
 def _joint(weights: Mapping[str, float]) -> dict[str, FloatArray]:
@@ -308,10 +310,10 @@ def _joint(weights: Mapping[str, float]) -> dict[str, FloatArray]:
 
 def _named_columns(head: HeadArrays) -> dict[str, FloatArray]:
     """(E,) directions by ARKit's name of the head's named expressions; ``_L`` and ``_R`` stand for Left and Right."""
-    found: dict[str, FloatArray] = {}
+    shapes: dict[str, FloatArray] = {}
     for name, column in zip(head.expression_names, np.eye(len(head.expression_names))):
         # browInnerUp is one shape in ARKit and a pair in others
         arkit = arkit_name(name) or arkit_name(re.sub("_[LR]$", "", name))
         if arkit:
-            found[arkit] = found.get(arkit, 0.0) + column
-    return found
+            shapes[arkit] = shapes.get(arkit, 0.0) + column
+    return shapes

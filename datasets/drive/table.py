@@ -231,13 +231,13 @@ def _categories(face: Any) -> dict[str, Any] | None:
     items = face.get(_CATEGORIES) if isinstance(face, dict) else face
     if not isinstance(items, list) or not items or not all(isinstance(item, dict) for item in items):
         return None
-    found = {}
+    columns = {}
     for item in items:
         names = [item[key] for key in _CATEGORY_NAMES if isinstance(item.get(key), str)]
         if not names or _SCORE not in item:
             return None
-        found[names[0]] = item[_SCORE]
-    return found
+        columns[names[0]] = item[_SCORE]
+    return columns
 
 
 def _csv(path: Path) -> SignalTable:

@@ -66,9 +66,9 @@ class Timing:
     def of_seconds(cls, seconds: FloatArray, column: str = "") -> Timing:
         """Frames at increasing times. Their rate is one of `RATES` near the usual step, or its mean without gaps."""
         steps = np.diff(seconds)
-        found = [1.0 / np.median(steps), 1.0 / steps[steps < GAP * np.median(steps)].mean()]
-        near = [rate for fps in found for rate in RATES if abs(fps - rate) <= NEAR * rate]
-        fps = float((near or found[1:])[0])
+        rates = [1.0 / np.median(steps), 1.0 / steps[steps < GAP * np.median(steps)].mean()]
+        near = [rate for fps in rates for rate in RATES if abs(fps - rate) <= NEAR * rate]
+        fps = float((near or rates[1:])[0])
         positions = (seconds - seconds[0]) * fps
         if (
             steps.min() * fps < 0.5 and abs(positions[-1] - len(steps)) < 0.5

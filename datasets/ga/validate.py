@@ -293,12 +293,12 @@ def find_leaks(
     """
     parts = {split: [images[key] for key in keys] for split, keys in splits.items()}
     contents = digests_of_same_size(parts, progress=progress)
-    found = []
+    leaks = []
     for one, other in combinations(splits, 2):
         names = f"{one} and {other}"
         shared = sorted({images[key] for key in splits[one]} & {images[key] for key in splits[other]})
         if shared:
-            found.append(
+            leaks.append(
                 f"{len(shared)} image files are in both {names}, such as {'/'.join(shared[0].parts[-3:])}"
             )
             continue
@@ -306,17 +306,17 @@ def find_leaks(
         equal = [key for key in splits[other] if contents.get(images[key]) in by_content]
         if equal:
             first = by_content[contents[images[equal[0]]]]
-            found.append(
+            leaks.append(
                 f"{counted(len(equal), 'image')} of the same content in {names}, such as {first} and {equal[0]}"
             )
     train = splits.get("train", ())
     timesteps = sorted({k.timestep for k in train} & {k.timestep for k in splits.get("self_reenactment", ())})
     if timesteps:
-        found.append(f"{len(timesteps)} self-reenactment timesteps are trained on, such as {timesteps[0]}")
+        leaks.append(f"{len(timesteps)} self-reenactment timesteps are trained on, such as {timesteps[0]}")
     cameras = sorted({k.camera for k in train} & {k.camera for k in splits.get("novel_view", ())})
     if cameras:
-        found.append(f"novel-view cameras are trained on: {', '.join(cameras)}")
-    return found
+        leaks.append(f"novel-view cameras are trained on: {', '.join(cameras)}")
+    return leaks
 
 
 def check_leaks(folder: Path, leaks: list[str], policy: LeakPolicy) -> list[str]:

@@ -59,12 +59,12 @@ def read_vertices(path: Path, count: int) -> FloatArray:
     """(V, 3) vertices of a Wavefront OBJ; faces are not read, since programs simplify them without changing the
     vertices."""
     content = read_bytes(path, "a Wavefront OBJ")
-    found = _VERTEX.findall(content)
-    if len(found) != count:
+    rows = _VERTEX.findall(content)
+    if len(rows) != count:
         remedy = "Give the head model the video was tracked with."
-        raise InputError(path, "v", f"{count} vertices, as the head model has", f"{len(found)}", remedy)
+        raise InputError(path, "v", f"{count} vertices, as the head model has", f"{len(rows)}", remedy)
     with reading(path, "three numbers for each vertex", "v"):  # no array of the longest word
-        vertices = np.array([[float(word) for word in vertex] for vertex in found])
+        vertices = np.array([[float(word) for word in vertex] for vertex in rows])
     check_numbers(path, "v", vertices, MAX_MAGNITUDE)
     return vertices
 

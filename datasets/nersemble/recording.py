@@ -97,12 +97,12 @@ def participants(root: Path) -> dict[str, Participant]:
     ids = {path.name for path in root.iterdir() if path.is_dir() and is_subject(path.name)}
     parts = [part for part in sorted(root.glob("sequence_*_part-*")) if part.is_dir()]
     ids |= {path.name for part in parts for path in part.iterdir() if path.is_dir() and is_subject(path.name)}
-    found = {name: _participant(root, parts, name, listed.get(name, ())) for name in sorted(ids)}
-    if not found:
+    by_id = {name: _participant(root, parts, name, listed.get(name, ())) for name in sorted(ids)}
+    if not by_id:
         expected = "folders named after participants (three digits), such as 074"
         names = ", ".join([path.name for path in entries(root)][:5]) or "an empty folder"
         raise InputError(root, "", expected, names, "Give the folder that holds the participants' folders.")
-    return found
+    return by_id
 
 
 def participant(root: Path, subject: str) -> Participant:

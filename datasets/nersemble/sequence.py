@@ -179,7 +179,7 @@ def _image_views(
 
 def _numbered(folder: Path, serials: Sequence[str]) -> dict[str, dict[int, Path]]:
     """Files of VHAP's preprocessing, which omits the serial for a single camera."""
-    found: dict[str, dict[int, Path]] = {}
+    frames: dict[str, dict[int, Path]] = {}
     for path in entries(folder):
         parsed = numbered(path.stem) if path.suffix.lower() in _IMAGE_SUFFIXES else None
         if parsed is None:
@@ -188,8 +188,8 @@ def _numbered(folder: Path, serials: Sequence[str]) -> dict[str, dict[int, Path]
         if not serial:
             expected = "names with a serial, cam_SERIAL_000000, or one camera to give them to"
             raise InputError(path, "", expected, f"{len(serials)} cameras", "Name the camera they are of.")
-        found.setdefault(serial, {})[parsed[1]] = path
-    return found
+        frames.setdefault(serial, {})[parsed[1]] = path
+    return frames
 
 
 def _frame_folders(folder: Path) -> dict[str, RecordedView]:

@@ -180,9 +180,9 @@ def cluster_expressions(
         labels, embedding = cluster_by_distance(distances, classes, seed=seed, variant=variant)
         landmarks, radius = len(faces), 0.0
     else:
-        found = farthest_meshes(faces, limit, seed=seed, tolerance=LANDMARK_TOLERANCE, progress=progress)
-        labels, embedding = cluster_by_distance(found.distances, classes, found.indices)
-        landmarks, radius = len(found.indices), found.radius
+        chosen = farthest_meshes(faces, limit, seed=seed, tolerance=LANDMARK_TOLERANCE, progress=progress)
+        labels, embedding = cluster_by_distance(chosen.distances, classes, chosen.indices)
+        landmarks, radius = len(chosen.indices), chosen.radius
     medoids = timesteps[_medoids(labels, embedding)]
     return ExpressionClusters(timesteps, labels, medoids, landmarks, radius, variant)
 
@@ -227,12 +227,12 @@ def cluster_by_distance(
 
 def _medoids(labels: IntArray, embedding: FloatArray) -> IntArray:
     """(classes,) item of each class nearest to the mean of the class."""
-    found = []
+    rows = []
     for label in range(labels.max() + 1):
         members = np.flatnonzero(labels == label)
         points = embedding[members]
-        found.append(members[np.square(points - points.mean(axis=0)).sum(axis=1).argmin()])
-    return np.array(found)
+        rows.append(members[np.square(points - points.mean(axis=0)).sum(axis=1).argmin()])
+    return np.array(rows)
 
 
 FACE_REGION, EYE_REGION = "face", "eye_region"

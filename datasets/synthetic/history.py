@@ -74,8 +74,8 @@ def follow(performed: Performed, moment: float, amount: float, length: float) ->
     def late(frequency: float, damping: float) -> Activations:
         # Weights and controls are rounded to grids, so the sums are exact.
         weights = shares(frequency, damping)
-        found: Mapping[str, float] = {name: float((weights * past[name]).sum()) for name in FOLLOWED}
-        moved = {name: now[name] + amount * (found[name] - now[name]) for name in FOLLOWED}
+        late_values: Mapping[str, float] = {name: float((weights * past[name]).sum()) for name in FOLLOWED}
+        moved = {name: now[name] + amount * (late_values[name] - now[name]) for name in FOLLOWED}
         return {**now, **moved}
 
     return Lagging(late(hair_frequency(length), HAIR_DAMPING), late(NECK_FREQUENCY, NECK_DAMPING))

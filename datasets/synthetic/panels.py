@@ -246,9 +246,9 @@ class PanelTracer:
                 break
             first += len(points)
         sides = 2 * (first + np.asarray(vertices, np.int64)) + back
-        found = np.zeros((len(sides), 6 + MOST_PANELS), np.float32)
-        world.light(sides, found, self._threads)
-        return found[:, :3], found[:, 3:6], found[:, 6:]
+        rows = np.zeros((len(sides), 6 + MOST_PANELS), np.float32)
+        world.light(sides, rows, self._threads)
+        return rows[:, :3], rows[:, 3:6], rows[:, 6:]
 
     def _current(self) -> Any:
         if self._world is not None and not self._moved:

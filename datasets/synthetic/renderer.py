@@ -132,8 +132,8 @@ def matte(alpha: FloatArray, hair: FloatArray, level: float, metre: float, seed:
     place = np.stack([columns.ravel(), rows.ravel(), np.zeros(alpha.size)], axis=1).astype(np.float64)
     field = fractal_noise(place, MATTE_PERIOD * metre, seed, 2).reshape(alpha.shape)
     edge = signed + level * MATTE_METRES * metre * field
-    found = np.clip(0.5 + edge / max(reach, 1.0), 0.0, 1.0)
-    return alpha + min(level, 1.0) * hair * (found - alpha)
+    alpha_mask = np.clip(0.5 + edge / max(reach, 1.0), 0.0, 1.0)
+    return alpha + min(level, 1.0) * hair * (alpha_mask - alpha)
 
 
 def develop(
@@ -243,14 +243,14 @@ class CaptureRenderer:
         alpha: FloatArray,
         background: FloatArray | None = None,
     ) -> tuple[ByteArray, ByteArray]:
-        settings, found = self._plan.settings, None
+        settings, estimate = self._plan.settings, None
         if settings.camera_colour and view.id in SERIALS:
             rgb = draw_response(settings.camera_colour, settings.seed, SERIALS.index(view.id))(rgb)
         if settings.mask_error:
             metre = float(view.K[0, 0]) / CAMERA_DISTANCE
-            found = matte(alpha, self.hair_pixels(view), settings.mask_error, metre, seed)
+            estimate = matte(alpha, self.hair_pixels(view), settings.mask_error, metre, seed)
         ground = self._plan.writer.plan.background if background is None else background
-        return develop(rgb, alpha, np.asarray(ground), found)
+        return develop(rgb, alpha, np.asarray(ground), estimate)
 
     def hair_pixels(self, view: Camera) -> FloatArray:
         """(H, W) in [0, 1] how far pixels belong to hair on the head in the present pose."""

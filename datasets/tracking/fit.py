@@ -206,16 +206,16 @@ class Fitter:
         root = np.asarray(self.head.joint_regressor[0], np.float64) @ neutral
         last = np.zeros(6)
         for row, pixels in enumerate(self.landmarks.pixels):
-            found = np.isfinite(pixels[..., 0])
+            seen = np.isfinite(pixels[..., 0])
             least = np.inf
-            for camera in np.argsort(-found.sum(axis=1), kind="stable")[:_TRIED]:
-                kept = found[camera]
+            for camera in np.argsort(-seen.sum(axis=1), kind="stable")[:_TRIED]:
+                kept = seen[camera]
                 if kept.sum() < _FEWEST:
                     continue
                 turn, moved = self._rigid(rest[kept], pixels[camera, kept], camera)
                 gaps = np.linalg.norm(self.views.place(rest @ turn.T + moved)[0] - pixels, axis=2)
-                if np.median(gaps[found]) < least:
-                    least = float(np.median(gaps[found]))
+                if np.median(gaps[seen]) < least:
+                    least = float(np.median(gaps[seen]))
                     last = np.concatenate([cv2.Rodrigues(turn)[0][:, 0], moved - root + turn @ root])
             poses[row, :3], poses[row, columns.translation] = last[:3], last[3:]
         return HeadState(shape, poses)
@@ -240,17 +240,17 @@ class Fitter:
         for row, pixels in enumerate(self.landmarks.pixels):
             posed = rig.linearised(state.shape, state.poses[row])
             projected = self.views.project(posed.points)
-            found = np.isfinite(pixels[..., 0])
-            gap = np.where(found[..., None], pixels - projected.pixels, 0.0)
+            seen = np.isfinite(pixels[..., 0])
+            gap = np.where(seen[..., None], pixels - projected.pixels, 0.0)
             per_metre = self.views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
             sigma = 1e-3 * LANDMARK_MM * per_metre
             square = (gap**2).sum(axis=2)
             # All landmarks of an image may be wrong if the network detects something else as a face.
             if leave_out:
                 near = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
-                found &= ((found & near).sum(axis=1) > found.sum(axis=1) / 2)[:, None]
-            robust = found * self.landmark_weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
-            distance[row] = np.sqrt((found * square).sum() / max(found.sum(), 1))
+                seen &= ((seen & near).sum(axis=1) > seen.sum(axis=1) / 2)[:, None]
+            robust = seen * self.landmark_weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
+            distance[row] = np.sqrt((seen * square).sum() / max(seen.sum(), 1))
             weighted = robust[..., None, None] * projected.derivative
             curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
             slope = np.einsum("cpki,cpk->pi", weighted, gap)

@@ -200,7 +200,7 @@ def check_interpreter(name: str, python: str, option: str = "--python") -> Path:
     expected = f"the modules {', '.join(program.modules)}"
     with tempfile.TemporaryDirectory() as elsewhere:  # the checkout itself is not importable there
         try:
-            found = subprocess.run(
+            completed = subprocess.run(
                 command,
                 cwd=elsewhere,
                 env=environment(),
@@ -211,8 +211,8 @@ def check_interpreter(name: str, python: str, option: str = "--python") -> Path:
             )
         except subprocess.TimeoutExpired:
             raise InputError(path, "", expected, f"none within {IMPORT_TIMEOUT_S:g} s", remedy) from None
-    if found.returncode:
-        message = found.stderr.strip().splitlines()[-1:] or [described(found.returncode)]
+    if completed.returncode:
+        message = completed.stderr.strip().splitlines()[-1:] or [described(completed.returncode)]
         raise InputError(path, "", expected, message[0], remedy)
     return path
 
@@ -357,5 +357,5 @@ def track_with_program(settings: TrackSettings, progress: Progress) -> CommandRe
         subject=subject,
         held_out_frames=settings.held_out_frames,
     )
-    found = import_tracking(given, progress)
-    return CommandResult(f"{message}\n{found.text}", found.data)
+    imported = import_tracking(given, progress)
+    return CommandResult(f"{message}\n{imported.text}", imported.data)

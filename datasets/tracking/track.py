@@ -394,10 +394,10 @@ def with_tracking(
         with progress(f"tracking {capture.subject}") as report:
             cameras = [*capture.cameras]
             source = landmark_source(capture, cameras, landmarks, teacher, seed)
-            found = track(capture, cameras, source, progress=report).clip
-        timesteps = sorted(found.poses)
-        rows = columns.rows([found.poses[timestep] for timestep in timesteps])
-        save_npz(place, {"shape": np.asarray(found.shape), "poses": rows, "timesteps": np.array(timesteps)})
+            tracked = track(capture, cameras, source, progress=report).clip
+        timesteps = sorted(tracked.poses)
+        rows = columns.rows([tracked.poses[timestep] for timestep in timesteps])
+        save_npz(place, {"shape": np.asarray(tracked.shape), "poses": rows, "timesteps": np.array(timesteps)})
     members = {"shape": Member("f", ("S",), MAX_MAGNITUDE), "poses": Member("f", ("T", "D"), MAX_MAGNITUDE)}
     members["timesteps"] = Member("i", ("T",))
     sizes = {"S": capture.head.shape_basis.shape[2], "D": columns.size}

@@ -156,8 +156,8 @@ class SelfieSegmentation:
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
         self._network.set_tensor(self._input["index"], small[None])
         self._network.invoke()
-        found: FloatArray = self._network.get_tensor(self._output["index"])[0, :, :, 0]
-        large = cv2.resize(found, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
+        probability: FloatArray = self._network.get_tensor(self._output["index"])[0, :, :, 0]
+        large = cv2.resize(probability, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
         return np.asarray(np.rint(255 * large.clip(0, 1)), np.uint8)
 
 

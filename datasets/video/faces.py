@@ -55,7 +55,7 @@ class FaceDetector:
 
     def detect(self, image: ByteArray) -> list[FaceCrop]:
         """Crops for a network of landmarks of the faces in an (H, W, 3) 8-bit RGB image, the highest score first."""
-        found = []
+        detections = []
         longer = max(image.shape[:2])
         for scale in (side / longer for side in SCALES if side <= max(longer, SIDE)):
             size = [max(1, round(scale * side)) for side in image.shape[1::-1]]
@@ -65,11 +65,11 @@ class FaceDetector:
                 part = small[max(0, top) : top + SIDE, max(0, left) : left + SIDE]
                 square[max(0, -top) :, max(0, -left) :][: len(part), : part.shape[1]] = part
                 scores, points = self._run(square)
-                found += [
+                detections += [
                     np.concatenate([[score], (one + [left, top]).ravel() / scale])
                     for score, one in zip(scores, points)
                 ]
-        return [_crop(one) for one in _merged(found)]
+        return [_crop(one) for one in _merged(detections)]
 
     def _run(self, square: ByteArray) -> tuple[FloatArray, FloatArray]:
         """Scores (N,) and points (N, 4, 2), two corners and both eyes, of a square of `SIDE` pixels, values from -1 to 1."""
@@ -147,10 +147,10 @@ class FaceFinder:
         """(COUNT, 2) landmarks of every face of an (H, W, 3) image, the largest first."""
         faces: list[FloatArray] = []
         for crop in self.detector.detect(image):
-            found = self.network.find_in(image, crop)
+            face = self.network.find_in(image, crop)
             # A part of a face that looks like one has a lower score.
-            if found is not None and all(face_distance(found, other) > 1 for other in faces):
-                faces.append(found)
+            if face is not None and all(face_distance(face, other) > 1 for other in faces):
+                faces.append(face)
         return sorted(faces, key=face_size, reverse=True)
 
 
@@ -277,8 +277,8 @@ class FaceFollower:
         return own
 
     def _near(self, image: ByteArray, before: FloatArray) -> FloatArray | None:
-        found = self.finder.follow(image, before)
-        return None if found is None else np.asarray(found, np.float32)
+        face = self.finder.follow(image, before)
+        return None if face is None else np.asarray(face, np.float32)
 
     def _own(self, new: Sequence[FloatArray], time: float) -> FloatArray | None:
         """The person's face among those that were not followed, the largest first; None if each is too far away."""

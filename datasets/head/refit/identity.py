@@ -143,10 +143,10 @@ def _counterparts(
         if not len(rows) or name not in source.regions:
             continue
         faces = source.faces[faces_in_region(source, name)]
-        found = closest_points(fitted[vertices[rows]], aligned, faces)
-        whole = whole + found.matrix(faces, len(aligned), rows, len(vertices))
+        closest = closest_points(fitted[vertices[rows]], aligned, faces)
+        whole = whole + closest.matrix(faces, len(aligned), rows, len(vertices))
         facing = np.einsum("ni,ni->n", normals[vertices[rows]], (whole @ source_normals)[rows])
-        kept[rows] = (found.distance < FARTHEST) & (facing > _FACING)
+        kept[rows] = (closest.distance < FARTHEST) & (facing > _FACING)
     return csr_array(whole), kept
 
 
@@ -180,13 +180,13 @@ def closest_points(points: FloatArray, vertices: FloatArray, faces: IntArray) ->
     centres = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
     size = np.floor(np.log2(np.maximum(radii, 1e-3 * radii.max() + np.finfo(float).tiny))).astype(np.int64)
-    found = ClosestPoints(
+    closest = ClosestPoints(
         np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3)), np.full(len(points), np.inf)
     )
     for alike in np.unique(size)[::-1]:
         members = np.flatnonzero(size == alike)
-        _search(points, corners[members], centres[members], float(radii[members].max()), members, found)
-    return found
+        _search(points, corners[members], centres[members], float(radii[members].max()), members, closest)
+    return closest
 
 
 def _search(

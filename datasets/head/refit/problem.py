@@ -359,12 +359,12 @@ def solve_frame(
         count += 1
         angles = np.where(searched, 0.0, fixed)
         angles[searched] = values * scale
-        found = problem.evaluate(frame, angles)
+        evaluation = problem.evaluate(frame, angles)
         if gradient.size:
-            gradient[:] = found.gradient[searched] * scale
-        if not best or found.value < best[0].value:
-            best[:] = [Solution(found.coefficients, angles, found.value, count)]
-        return found.value
+            gradient[:] = evaluation.gradient[searched] * scale
+        if not best or evaluation.value < best[0].value:
+            best[:] = [Solution(evaluation.coefficients, angles, evaluation.value, count)]
+        return evaluation.value
 
     first = np.clip(start, -limit, limit)[searched] / scale
     if not searched.any():

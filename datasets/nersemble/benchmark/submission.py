@@ -151,7 +151,7 @@ def find_frames(
     ``method``: Method to use from a run with several. ``data``: The benchmark's folder, which gives the number of frames of
     a sequence if that is not published.
     """
-    found: dict[Video, list[Path]] = {}
+    files: dict[Video, list[Path]] = {}
     by_participant = {name: _by_camera(folder, name, method) for name in track.sequences}
     lacking = []
     for video in track.videos(data):
@@ -168,20 +168,20 @@ def find_frames(
         if numbers[-1] - numbers[0] + 1 != len(numbers):
             gap = next(b for a, b in pairwise(numbers) if b != a + 1) - 1
             raise InputError(where, key, "timesteps without a gap", f"none of timestep {gap}")
-        found[video] = [frames[number] for number in numbers]
+        files[video] = [frames[number] for number in numbers]
     if lacking:
-        expected = f"frames of {len(found) + len(lacking)} videos, such as {lacking[0]}"
+        expected = f"frames of {len(files) + len(lacking)} videos, such as {lacking[0]}"
         remedy = "Frames are PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png, as `headbench submission render` writes them."
         raise InputError(folder, "", expected, f"none for {len(lacking)} of them", remedy)
-    _check_lengths(folder, track, {video: len(frames) for video, frames in found.items()})
-    for paths in found.values():
+    _check_lengths(folder, track, {video: len(frames) for video, frames in files.items()})
+    for paths in files.values():
         for path in paths:
             info = probe_image(path)
             if (info.width, info.height) != track.size or info.channels != 3:
                 size = "x".join(map(str, track.size))
                 expected = f"RGB of {size} pixels, the size of this track"
                 raise InputError(path, "", expected, f"{info.width}x{info.height}, {info.channels} channels")
-    return found
+    return files
 
 
 def _by_camera(folder: Path, participant: str, method: str) -> dict[tuple[str, str], dict[int, Path]]:
@@ -198,13 +198,13 @@ def _by_camera(folder: Path, participant: str, method: str) -> dict[tuple[str, s
             )
             raise InputError(home, "--method", expected, names)
         places = sorted(path for path in chosen[0].iterdir() if path.is_dir())
-    found: dict[tuple[str, str], dict[int, Path]] = {}
+    files: dict[tuple[str, str], dict[int, Path]] = {}
     for place in places:
         for path in sorted(place.iterdir()) if place.is_dir() else ():
             if match := _FRAME.fullmatch(path.name):
-                of = found.setdefault((match["sequence"], match["camera"]), {})
+                of = files.setdefault((match["sequence"], match["camera"]), {})
                 of[int(match["timestep"])] = path
-    return found
+    return files
 
 
 def _check_lengths(where: Path, track: BenchmarkTrack, counts: dict[Video, int]) -> None:

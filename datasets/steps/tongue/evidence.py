@@ -130,8 +130,8 @@ def _strength(values: dict[str, FloatArray], known: np.ndarray) -> FloatArray:
     not_dark = values["light"] > lowest["light"] - _DARKER
     lost = lowest["pink"] - values["pink"] > PIGMENT_LOST * np.maximum(lowest["pink"], _LEAST_PIGMENT)
     strength = np.where(lost & not_pale & not_dark, strength, np.minimum(strength, 0))
-    found: FloatArray = np.where(known, strength, 0).astype(np.float32)
-    return found
+    covered: FloatArray = np.where(known, strength, 0).astype(np.float32)
+    return covered
 
 
 def _features(colours: ByteArray, seen: np.ndarray) -> dict[str, FloatArray]:
