@@ -59,10 +59,8 @@ class HeadRegions:
         return tuple(name for name in PARTS if _NEEDED[name] in self._head.regions)
 
     def labels(self, camera: Camera, pose: HeadPose, mask: ByteArray | None) -> ByteArray:
-        """(H, W) 8-bit, one bit for each region that a pixel is in; see `select`.
-
-        ``mask`` is the (H, W) 8-bit coverage; with None nothing is foreground.
-        """
+        """(H, W) 8-bit, one bit for each region that a pixel is in; see `select`. ``mask`` is the (H, W) 8-bit
+        coverage; with None nothing is foreground."""
         front = rasterize_mesh(self._subject.meshes([pose])[0], self._head.faces, camera).face
         covered = front >= 0
         labels = np.where(covered, self._bits_of_faces[np.maximum(front, 0)], 0).astype(np.uint8)
@@ -127,10 +125,8 @@ def _beyond(covered: BoolArray, part: BoolArray) -> BoolArray:
 
 
 class FrameFiles(NamedTuple):
-    """Files of a frame's pixels, and its recorded key if a step changed the key.
-
-    A clip of an external reader may have no files; its pixels come from `CaptureClip.source`.
-    """
+    """Files of a frame's pixels, and its recorded key if a step changed the key. A clip of an external reader may have
+    no files; its pixels come from `CaptureClip.source`."""
 
     image: Path | None
     mask: Path | None
@@ -192,10 +188,8 @@ class CaptureClip:
         return digest(self.source_fingerprint, [*self.steps], splits, excluded, self.background)
 
     def image(self, key: FrameKey) -> ByteArray:
-        """(H, W, 3) 8-bit sRGB, composited on `background`; read-only, shared with the store.
-
-        Raises `InputError` for a key the clip does not have.
-        """
+        """(H, W, 3) 8-bit sRGB, composited on `background`; read-only, shared with the store. Raises `InputError` for a
+        key the clip does not have."""
         if self.pixel_steps:
             return self._processed(key, "image")
         files = self._files(key)
@@ -322,10 +316,8 @@ def check_apart(clip: CaptureClip, out: Path) -> None:
 
 
 def as_capture(clip: Clip) -> CaptureClip:
-    """Any clip as a `CaptureClip` for steps and commands; a `CaptureClip` is returned unchanged.
-
-    Pixels are read from ``clip``.
-    """
+    """Any clip as a `CaptureClip` for steps and commands; a `CaptureClip` is returned unchanged. Pixels are read from
+    ``clip``."""
     if isinstance(clip, CaptureClip):
         return clip
     where = f"clip {clip.subject}"

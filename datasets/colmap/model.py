@@ -86,10 +86,8 @@ class Lens:
         return self._fisheye or bool(self._coefficients.any())
 
     def map_from(self, K: FloatArray, width: int, height: int) -> FloatArray:
-        """(height, width, 2) float32 position of each pixel of a pinhole image in the distorted one, pixels.
-
-        Far outside the calibrated view a polynomial may fold back into the image; such positions are moved outside.
-        """
+        """(height, width, 2) float32 position of each pixel of a pinhole image in the distorted one, pixels. Far
+        outside the calibrated view a polynomial may fold back into the image; such positions are moved outside."""
         # OpenCV's origin is the centre of the top left pixel.
         half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         undo = cv2.fisheye.initUndistortRectifyMap if self._fisheye else cv2.initUndistortRectifyMap
@@ -114,10 +112,8 @@ class Lens:
 
 
 def _unfolded(places: FloatArray, K: FloatArray) -> np.ndarray:
-    """(H, W) bool: connected region around the principal point in which a map keeps its orientation.
-
-    Outside a ring in which the lens's polynomial decreases it may increase again, mirrored twice.
-    """
+    """(H, W) bool: connected region around the principal point in which a map keeps its orientation. Outside a ring in
+    which the lens's polynomial decreases it may increase again, mirrored twice."""
     height, width = places.shape[:2]
     if min(width, height) < 2:
         return np.ones((height, width), dtype=bool)
@@ -130,10 +126,8 @@ def _unfolded(places: FloatArray, K: FloatArray) -> np.ndarray:
 
 
 def undistort_image(image: FloatArray, places: FloatArray, background: FloatArray | float) -> FloatArray:
-    """Resample a float32 image (H, W) or (H, W, 3) by a map of `Lens.map_from`; ``background`` outside of it.
-
-    Bicubic, with places rounded to 1/32 pixel, and clamped to [0, 1].
-    """
+    """Resample a float32 image (H, W) or (H, W, 3) by a map of `Lens.map_from`; ``background`` outside of it. Bicubic,
+    with places rounded to 1/32 pixel, and clamped to [0, 1]."""
     ground = [float(value) for value in np.broadcast_to(np.asarray(background, np.float64), (3,))]
     x, y = (np.ascontiguousarray(places[..., axis] - np.float32(0.5)) for axis in (0, 1))
     moved = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=ground)

@@ -280,10 +280,8 @@ class _Observation(NamedTuple):
 
 
 def image_name(key: FrameKey, naming: Naming = "nested") -> str:
-    """Name of a frame in the model and its path under ``images/``.
-
-    "nested": subject/sequence/timestep/camera.png; "flat": sequence_timestep_camera.png.
-    """
+    """Name of a frame in the model and its path under ``images/``. "nested": subject/sequence/timestep/camera.png;
+    "flat": sequence_timestep_camera.png."""
     return f"{key}.png" if naming == "nested" else f"{key.sequence}_{key.timestep:05d}_{key.camera}.png"
 
 
@@ -396,10 +394,8 @@ def _add_points(model: Any, vertices: FloatArray, views: dict[int, _Observation]
 
 
 def _write_model(model: Any, folder: Path, model_format: ModelFormat) -> None:
-    """Write a model to a temporary folder, then copy its files, so that no file is incomplete.
-
-    Files of the other format are removed first because readers prefer binary files even if they are older.
-    """
+    """Write a model to a temporary folder, then copy its files, so that no file is incomplete. Files of the other
+    format are removed first because readers prefer binary files even if they are older."""
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
         if model_format == "bin":

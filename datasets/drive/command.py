@@ -127,10 +127,8 @@ REST = "REST"
 
 
 def canonical(head: HeadArrays) -> HeadPose:
-    """The face at rest with an open mouth, as VHAP's canonical parameters have it: unlike the frames of any signal at rest.
-
-    Splits of a capture must not share images.
-    """
+    """The face at rest with an open mouth, as VHAP's canonical parameters have it: unlike the frames of any signal at
+    rest. Splits of a capture must not share images."""
     return replace(resting(head), jaw=np.array(CANONICAL_JAW))
 
 
@@ -167,10 +165,8 @@ def write_driven_video(path: Path, renderer: Renderer, clip: CaptureClip, fps: f
 
 
 def write_driven_capture(out: Path, renderer: Renderer, clip: CaptureClip) -> Path:
-    """Write the frames and poses of a clip in the GaussianAvatars layout; return the folder for readers.
-
-    The driven sequence is held out for self-reenactment; the sequence `REST` is for training.
-    """
+    """Write the frames and poses of a clip in the GaussianAvatars layout; return the folder for readers. The driven
+    sequence is held out for self-reenactment; the sequence `REST` is for training."""
     keys = list(clip.splits["self_reenactment"])
     sequences: dict[str, list[HeadPose]] = {}
     places = []
@@ -203,10 +199,8 @@ _JAW = JOINT_NAMES.index("jaw")
 
 
 class DrivenMeasures:
-    """Measures on the vertices of one subject.
-
-    ``shape``: (S,) identity of the avatar. ``static_offset``: (V, 3) metres.
-    """
+    """Measures on the vertices of one subject. ``shape``: (S,) identity of the avatar. ``static_offset``: (V, 3)
+    metres."""
 
     def __init__(self, head: HeadArrays, shape: FloatArray, static_offset: FloatArray):
         self._subject = PosedSubject(head, shape, static_offset)
@@ -344,10 +338,8 @@ def measured(
     found: Transferred,
     motion: tuple[Any, Any],
 ) -> dict[str, Any]:
-    """Measures of the driven poses as plain values, and the channels of the signal that drive nothing.
-
-    ``motion`` has the poses before and after smoothing.
-    """
+    """Measures of the driven poses as plain values, and the channels of the signal that drive nothing. ``motion`` has
+    the poses before and after smoothing."""
     measures = DrivenMeasures(scene.head, scene.clip.shape, scene.clip.static_offset)
     before, after = motion
     reference = settings.neutral or 0

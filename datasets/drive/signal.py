@@ -88,10 +88,8 @@ def _loaded(name: str) -> HeadArrays:
 
 
 def make_poses(path: Path, head: HeadArrays, parts: Mapping[str, FloatArray]) -> list[HeadPose]:
-    """Poses of (T, n) arrays by name: expression, eyelids and those of `POSE_PARTS`; missing ones are 0.
-
-    Fewer expression coefficients than the head model has are padded with zeros; eyelids are left out if it has no basis.
-    """
+    """Poses of (T, n) arrays by name: expression, eyelids and those of `POSE_PARTS`; missing ones are 0. Fewer
+    expression coefficients than the head model has are padded with zeros; eyelids are left out if it has no basis."""
     length = len(next(iter(parts.values())))
     size = head.expression_basis.shape[2]
     lids = 0 if head.eyelid_basis is None else head.eyelid_basis.shape[2]
@@ -228,10 +226,8 @@ def read_blendshapes(request: SignalRequest) -> DrivingSignal:
 def apply_blendshapes(
     request: SignalRequest, channels: Mapping[str, FloatArray], timing: Timing
 ) -> DrivingSignal:
-    """Poses of the head that performs the blendshapes: the one given, else the embedded one.
-
-    ``channels``: (T,) values by ARKit's name.
-    """
+    """Poses of the head that performs the blendshapes: the one given, else the embedded one. ``channels``: (T,) values
+    by ARKit's name."""
     if request.signal_head:
         head = request.head()
     elif is_embedded(request.target):

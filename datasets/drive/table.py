@@ -112,10 +112,8 @@ class SignalTable:
         )
 
     def values(self, name: str) -> FloatArray:
-        """(T, n) float64 values of a column; n is 1 for single numbers.
-
-        Raises `InputError` for values that are not finite numbers within `MAX_MAGNITUDE`, and for frames of unequal length.
-        """
+        """(T, n) float64 values of a column; n is 1 for single numbers. Raises `InputError` for values that are not
+        finite numbers within `MAX_MAGNITUDE`, and for frames of unequal length."""
         column = self.columns[name]
         if len(column) != len(self):
             raise InputError(self.path, name, f"{len(self)} frames, as other columns have", str(len(column)))
@@ -163,9 +161,7 @@ class SignalTable:
 
 def read_table(path: Path, fps: float | None = None) -> SignalTable:
     """Read a file by its ending, or a folder with files of each frame. Times are those of a column, if there are any.
-
-    With ``fps``, frames per second, a column of times that gives no rate is no error.
-    """
+    With ``fps``, frames per second, a column of times that gives no rate is no error."""
     read = _folder if path.is_dir() else _READERS.get(path.suffix.lower())
     if read is None:
         expected = f"a file in {', '.join(_READERS)}, or a folder"

@@ -87,10 +87,8 @@ def natural_order(path: Path) -> list[tuple[bool, int | str]]:
 
 
 def in_order(paths: Sequence[Path]) -> tuple[list[Path], Timing]:
-    """Files or folders of one frame each by the number of the frame in their names, and their times.
-
-    The frame's is the first number that varies; some or all names may have a second, such as a face's.
-    """
+    """Files or folders of one frame each by the number of the frame in their names, and their times. The frame's is the
+    first number that varies; some or all names may have a second, such as a face's."""
     paths = sorted(paths, key=natural_order)
     numbers = [[int(part) for part in re.findall(r"\d+", path.stem)] for path in paths]
     varying = [values for values in zip(*numbers) if len({*values}) > 1]
@@ -151,10 +149,8 @@ def from_columns(
 
 
 def _seconds(column: Sequence[Any]) -> FloatArray | None:
-    """(T,) seconds of clock times, timecodes or numbers, whose unit follows from the rate; None for other values.
-
-    The rate of timecodes is the lowest above all their numbers of frames; within one second they give none.
-    """
+    """(T,) seconds of clock times, timecodes or numbers, whose unit follows from the rate; None for other values. The
+    rate of timecodes is the lowest above all their numbers of frames; within one second they give none."""
     clocks = [_CLOCK.fullmatch(str(value).strip()) for value in column]
     values, units = _finite(column), UNITS
     if all(clocks):

@@ -242,9 +242,7 @@ def _eyelids(pose: HeadPose, target: HeadArrays) -> FloatArray | None:
 
 class LiveDriver:
     """Converts lines of one frame each (coefficients or blendshapes, as for `read_signal`) to poses of a head model.
-
-    ``target``: Head model of the avatar. ``signal_head``: See `settings.DriveSettings`.
-    """
+    ``target``: Head model of the avatar. ``signal_head``: See `settings.DriveSettings`."""
 
     def __init__(self, target: HeadAsset, signal_head: str = ""):
         if not isinstance(target, HeadArrays):

@@ -154,10 +154,8 @@ def content_digests(
 def digests_of_same_size(
     splits: Mapping[str, Sequence[Path]], *, progress: Progress = no_progress
 ) -> dict[Path, str]:
-    """Digests as by `content_digests` of the files that have the same size as one of another split.
-
-    Paths that name no file are left out.
-    """
+    """Digests as by `content_digests` of the files that have the same size as one of another split. Paths that name no
+    file are left out."""
     sizes = {path: path.stat().st_size for part in splits.values() for path in part if path.is_file()}
     splits_of: dict[int, set[str]] = defaultdict(set)
     for split, part in splits.items():
@@ -255,10 +253,8 @@ def _check_size(entry: FrameEntry, path: Path, info: ImageInfo, image: ImageInfo
 
 
 def check_timesteps(folder: Path, entries: Sequence[FrameEntry]) -> None:
-    """Check that timesteps are numbered from 0 without a gap, each with one parameter file and one sequence.
-
-    Readers of the layout index arrays by timestep, so a gap would shift all following parameters.
-    """
+    """Check that timesteps are numbered from 0 without a gap, each with one parameter file and one sequence. Readers of
+    the layout index arrays by timestep, so a gap would shift all following parameters."""
     timesteps = timesteps_of(entries)
     if not entries:
         raise InputError(folder, "frames", "at least one frame", "none")
@@ -328,10 +324,8 @@ def check_leaks(folder: Path, leaks: list[str], policy: LeakPolicy) -> list[str]
 
 
 def sequence_names(entries: Iterable[FrameEntry], declared: Mapping[str, str]) -> dict[str, str]:
-    """Sequence name by sequence folder: the declared one, else the one in the folder's name.
-
-    Folders whose names give the same sequence keep their full names.
-    """
+    """Sequence name by sequence folder: the declared one, else the one in the folder's name. Folders whose names give
+    the same sequence keep their full names."""
     folders = sorted({entry.sequence_folder for entry in entries})
     names = {folder: declared.get(folder) or parse_sequence_folder(folder)[1] for folder in folders}
     taken = [*names.values()]
@@ -386,10 +380,8 @@ def _match(file: Path, wanted: str, available: Sequence[str]) -> str:
 
 
 def require_full_grid(clip: CaptureClip, source: str | Path = "") -> None:
-    """Check that every camera has a frame at every timestep; excluded frames count as existing.
-
-    ``source``: The capture that the clip was read from, for the message.
-    """
+    """Check that every camera has a frame at every timestep; excluded frames count as existing. ``source``: The capture
+    that the clip was read from, for the message."""
     timesteps = sorted({(key.sequence, key.timestep) for key in clip.files})
     wanted = (
         FrameKey(clip.subject, sequence, timestep, camera)

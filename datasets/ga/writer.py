@@ -264,10 +264,8 @@ class CaptureWriter:
     def write_frame(
         self, sequence: str, timestep: int, camera: str, image: ByteArray, mask: ByteArray | None = None
     ) -> None:
-        """Write one image, (H, W, 3) RGB or (H, W, 4) straight-alpha RGBA, and its (H, W) mask.
-
-        Each is written atomically, the image last, so a frame with an existing image is complete.
-        """
+        """Write one image, (H, W, 3) RGB or (H, W, 4) straight-alpha RGBA, and its (H, W) mask. Each is written
+        atomically, the image last, so a frame with an existing image is complete."""
         if mask is not None:
             write_image(self.mask_path(sequence, timestep, camera), mask)
         write_image(self.image_path(sequence, timestep, camera), image)

@@ -50,10 +50,8 @@ OPTIONAL = ("eyelid_basis", "uv")
 
 @dataclass(frozen=True, eq=False)
 class HeadArrays:
-    """A head model in FLAME's layout (a `HeadAsset`). Units: metres.
-
-    V vertices, F triangles, S identity and E expression directions, J joints in the order of `JOINT_NAMES`.
-    """
+    """A head model in FLAME's layout (a `HeadAsset`). Units: metres. V vertices, F triangles, S identity and E
+    expression directions, J joints in the order of `JOINT_NAMES`."""
 
     version: str
     """Name of the expression basis, equal to ``HeadPose.head_model`` of its poses."""
@@ -85,10 +83,7 @@ class HeadArrays:
     chart."""
 
     def validate(self, file: str | PathLike[str]) -> HeadArrays:
-        """Validate the model and return self.
-
-        ``file``: Source of the arrays, named in the error.
-        """
+        """Validate the model and return self. ``file``: Source of the arrays, named in the error."""
         arrays = {name: np.asarray(getattr(self, name)) for name in STORED} | self._optional()
         sizes = {"J": len(JOINT_NAMES), "9 (J - 1)": 9 * (len(JOINT_NAMES) - 1)}
         sizes = check_arrays(file, arrays, _MEMBERS, sizes)
@@ -114,11 +109,8 @@ class HeadArrays:
     def __call__(
         self, pose: HeadPose, shape: FloatArray | None = None, static_offset: FloatArray | None = None
     ) -> FloatArray:
-        """Vertices (V, 3) in a pose, metres, float64.
-
-        ``shape``: (S,) identity coefficients; None for the mean head. ``static_offset``: (V, 3) metres, added to the shaped
-        template.
-        """
+        """Vertices (V, 3) in a pose, metres, float64. ``shape``: (S,) identity coefficients; None for the mean head.
+        ``static_offset``: (V, 3) metres, added to the shaped template."""
         from .model import PosedSubject  # with torch
 
         shape = np.zeros(self.shape_basis.shape[2]) if shape is None else shape

@@ -42,10 +42,8 @@ def mesh_edges(faces: IntArray) -> IntArray:
 
 
 def unique_pairs(pairs: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Unique rows of an (n, 2) array of indices, sorted, (m, 2); inverse indices (n,); counts (m,).
-
-    Ten times faster than `numpy.unique` along an axis because pairs are compared as single numbers.
-    """
+    """Unique rows of an (n, 2) array of indices, sorted, (m, 2); inverse indices (n,); counts (m,). Ten times faster
+    than `numpy.unique` along an axis because pairs are compared as single numbers."""
     base = int(pairs.max(initial=0)) + 1
     codes, inverse, count = np.unique(
         pairs[:, 0].astype(np.int64) * base + pairs[:, 1], return_inverse=True, return_counts=True
@@ -78,11 +76,8 @@ def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
 
 
 def even_weights(points: FloatArray, target: FloatArray) -> FloatArray:
-    """(n,) weights of points (n, 3) that sum to 1 and reproduce the target, as even as possible.
-
-    The target then moves with the points in every translation, rotation and scaling. Raises `ValueError` if the points
-    do not span it.
-    """
+    """(n,) weights of points (n, 3) that sum to 1 and reproduce the target, as even as possible. The target then moves
+    with the points in every translation, rotation and scaling. Raises `ValueError` if the points do not span it."""
     constraints = np.vstack([points.T, np.ones(len(points))])
     even = np.full(len(points), 1 / len(points))
     wanted = np.array([*target, 1.0])

@@ -104,10 +104,8 @@ def _positions(upper: FloatArray, lower: FloatArray) -> FloatArray:
 
 
 def _triangles(columns: int, towards_left: bool) -> IntArray:
-    """Triangles of the six strips, seen from outside counter-clockwise, as indices into the new vertices.
-
-    In the order of GaussianAvatars, whose splats are bound to triangles by index and rotate with their first edge.
-    """
+    """Triangles of the six strips, seen from outside counter-clockwise, as indices into the new vertices. In the order
+    of GaussianAvatars, whose splats are bound to triangles by index and rotate with their first edge."""
     block = {name: index * columns + np.arange(columns) for index, name in enumerate(ROWS)}
     strips = []
     for first, second, falling, turned in (

@@ -28,10 +28,8 @@ from .statistics import KEPT_VARIANCE, ExpressionSpace, SequenceRow, SplitRow
 
 
 def draw_overlay(clip: CaptureClip, timesteps: Sequence[int], cameras: Sequence[str]) -> ByteArray:
-    """Images of some timesteps (rows) and cameras, and beside each one the mesh over it.
-
-    Returns (H, W, 3) 8-bit sRGB. Images of another size than the first are left out.
-    """
+    """Images of some timesteps (rows) and cameras, and beside each one the mesh over it. Returns (H, W, 3) 8-bit sRGB.
+    Images of another size than the first are left out."""
     subject, rows = PosedSubject.of(clip), []
     height, width = clip.image(clip.frame_at[timesteps[0], cameras[0]]).shape[:2]
     for timestep, mesh in subject.each(clip, timesteps):

@@ -167,10 +167,8 @@ def _doubted(facts: Mapping[str, CameraFacts]) -> list[str]:
 
 
 def _pick_timesteps(capture: Capture, entries: Sequence[FrameEntry], count: int) -> dict[int, list[int]]:
-    """Timesteps to measure and, for each lag from -`MAX_LAG` to `MAX_LAG`, the timesteps of the poses.
-
-    From each of ``count`` equal parts of the capture, the timestep with the fastest head motion is selected.
-    """
+    """Timesteps to measure and, for each lag from -`MAX_LAG` to `MAX_LAG`, the timesteps of the poses. From each of
+    ``count`` equal parts of the capture, the timestep with the fastest head motion is selected."""
     sequences: dict[str, set[int]] = defaultdict(set)
     for entry in entries:
         sequences[entry.sequence_folder].add(entry.timestep)

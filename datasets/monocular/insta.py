@@ -130,11 +130,8 @@ class MeshFit:
         return Identity(shape, turns, _middle(self._posed(shaped[None], turns[None])[0] - mesh))
 
     def fit_pose(self, mesh: FloatArray, shaped: FloatArray, known: FloatArray | None) -> Pose:
-        """Jaw, eyes and eyelids of one mesh.
-
-        ``mesh``: (V, 3). ``shaped``: (V, 3) head with identity and expression, unposed. ``known``: (9,) jaw and eyes if they
-        are known; only the eyelids are fitted then.
-        """
+        """Jaw, eyes and eyelids of one mesh. ``mesh``: (V, 3). ``shaped``: (V, 3) head with identity and expression,
+        unposed. ``known``: (9,) jaw and eyes if they are known; only the eyelids are fitted then."""
         turns, lids = np.zeros(9) if known is None else known, np.zeros(self._lids.shape[2])
         rows = self._rows
         by_lids = self._lids[rows].reshape(3 * len(rows), -1)

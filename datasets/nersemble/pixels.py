@@ -88,10 +88,8 @@ _ENCODED.flags.writeable = False
 
 @dataclass(frozen=True, eq=False)
 class AffineCorrection:
-    """Version 1: ``out = rgb @ matrix[:, :3] + matrix[:, 3]`` on stored values in [0, 1], clipped.
-
-    ``rgb`` is a row on the left, so the linear part is the transpose of the usual form.
-    """
+    """Version 1: ``out = rgb @ matrix[:, :3] + matrix[:, 3]`` on stored values in [0, 1], clipped. ``rgb`` is a row on
+    the left, so the linear part is the transpose of the usual form."""
 
     matrix: FloatArray  # (3, 4)
 

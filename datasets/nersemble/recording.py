@@ -183,10 +183,8 @@ class Calibration:
         return [*self.world_to_camera]
 
     def camera(self, serial: str, size: tuple[int, int], output: tuple[int, int]) -> Camera:
-        """Camera for images of ``output`` size made of images of ``size``, both (width, height).
-
-        Pixels scale with the edges of the image: no half-pixel term.
-        """
+        """Camera for images of ``output`` size made of images of ``size``, both (width, height). Pixels scale with the
+        edges of the image: no half-pixel term."""
         width, height = self.size or size
         if abs(size[0] * height - size[1] * width) > max(width, height):
             expected = f"images of the shape of {width}x{height}, which the intrinsics refer to"

@@ -246,10 +246,8 @@ def probe_video(path: Path) -> tuple[int, tuple[int, int]]:
 
 
 def open_video(path: Path) -> cv2.VideoCapture:
-    """Open a video on one decoding thread, since streams run in parallel.
-
-    Pixels are read as stored, without the rotation in the file's metadata.
-    """
+    """Open a video on one decoding thread, since streams run in parallel. Pixels are read as stored, without the
+    rotation in the file's metadata."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     if not capture.isOpened():

@@ -254,11 +254,8 @@ class Landmarks(NamedTuple):
 
 
 def expression_displacements(clip: Clip, timesteps: Sequence[int]) -> FloatArray:
-    """(T, 3, F) float32 displacements of the face's F vertices from the neutral face, metres.
-
-    Meshes have jaw, eyes and expression, but no rotation, neck and translation; vertices of the eye region have weight
-    `EYE_WEIGHT`.
-    """
+    """(T, 3, F) float32 displacements of the face's F vertices from the neutral face, metres. Meshes have jaw, eyes and
+    expression, but no rotation, neck and translation; vertices of the eye region have weight `EYE_WEIGHT`."""
     vertices, weights = _face_vertices(clip.head)
     subject = PosedSubject.of(clip, torch.float32)
     poses = [pose_in_head_frame(clip.poses[timestep]) for timestep in timesteps]

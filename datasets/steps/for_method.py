@@ -59,10 +59,8 @@ class Alignment:
 
     @classmethod
     def of(cls, source: Size, rule: ResolutionRule) -> Alignment:
-        """Apply a rule to an image size. Operations without effect are omitted.
-
-        A side that is not a multiple of the divisor is rounded down, which makes its pixels slightly larger.
-        """
+        """Apply a rule to an image size. Operations without effect are omitted. A side that is not a multiple of the
+        divisor is rounded down, which makes its pixels slightly larger."""
         moves: list[Resize | PixelBox] = []
         width, height = source
         if rule.square and width != height:
@@ -96,10 +94,8 @@ class Alignment:
         return camera
 
     def image(self, image: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
-        """Align a composited float32 image (H, W, 3) in [0, 1]; boxes are padded with ``background``.
-
-        Coverage is aligned the same way as (H, W, 1) on background 0.
-        """
+        """Align a composited float32 image (H, W, 3) in [0, 1]; boxes are padded with ``background``. Coverage is
+        aligned the same way as (H, W, 1) on background 0."""
         _check_size("image", self.source, (image.shape[1], image.shape[0]))
         for move in self.moves:
             if isinstance(move, Resize):
@@ -109,10 +105,8 @@ class Alignment:
         return image
 
     def restore(self, render: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
-        """Convert an (H, W, 3) render of the aligned view to the source's size, in one antialiased resizing.
-
-        Cropped parts become ``background``.
-        """
+        """Convert an (H, W, 3) render of the aligned view to the source's size, in one antialiased resizing. Cropped
+        parts become ``background``."""
         _check_size("render", self.aligned_size, (render.shape[1], render.shape[0]))
         boxes = [move for move in self.moves if isinstance(move, PixelBox)]
         box = boxes[0] if boxes else PixelBox(0, 0, *self.source)

@@ -16,10 +16,8 @@ from ..head.model import PosedSubject
 
 
 def as_rigid_head(clip: Clip, config: RunConfig) -> CaptureClip:
-    """A clip whose poses have no rotation of the neck: root and translation make up the motion of the head.
-
-    Vertices that fully follow the neck do not move; those below it follow the head. Images are unchanged.
-    """
+    """A clip whose poses have no rotation of the neck: root and translation make up the motion of the head. Vertices
+    that fully follow the neck do not move; those below it follow the head. Images are unchanged."""
     source = as_capture(clip)
     subject = PosedSubject.of(source)
     poses = list(source.poses.values())

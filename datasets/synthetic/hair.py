@@ -235,10 +235,8 @@ def grow(
     keep_out: Callable[[FloatArray, float], FloatArray],
     segments: int,
 ) -> FloatArray:
-    """Polylines (n, segments + 1, 3) from ``roots`` along ``field``, each of its own length.
-
-    ``keep_out(points, share)`` moves points inside the head out of it.
-    """
+    """Polylines (n, segments + 1, 3) from ``roots`` along ``field``, each of its own length. ``keep_out(points,
+    share)`` moves points inside the head out of it."""
     path = [roots]
     step = (lengths / segments)[:, None]
     for index in range(segments):

@@ -64,10 +64,8 @@ def shares(frequency: float, damping: float) -> FloatArray:
 
 
 def follow(performed: Performed, moment: float, amount: float, length: float) -> Lagging:
-    """Delayed controls at a ``moment`` (seconds) for hair of ``length`` metres and for the neck.
-
-    ``amount`` scales the distance to the controls of that moment. Before a sequence the head is still.
-    """
+    """Delayed controls at a ``moment`` (seconds) for hair of ``length`` metres and for the neck. ``amount`` scales the
+    distance to the controls of that moment. Before a sequence the head is still."""
     past = performed.curves(np.maximum(moment - (np.arange(round(_MEMORY * RATE)) + 0.5) / RATE, 0.0))
     now = {name: float(values[0]) for name, values in performed.curves(np.array([moment])).items()}
 

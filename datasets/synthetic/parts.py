@@ -67,10 +67,8 @@ def render_parts(
 
 
 def dental_arch(length: FloatArray, front: float) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3) at arc ``length`` from the midline along the arch, y = 0, and outward normals (n, 3).
-
-    ``length`` is in metres and ends at ``arch_length()`` on either side.
-    """
+    """Points (n, 3) at arc ``length`` from the midline along the arch, y = 0, and outward normals (n, 3). ``length`` is
+    in metres and ends at ``arch_length()`` on either side."""
     x = np.linspace(-ARCH_REACH, ARCH_REACH, 401)
     px = np.interp(length, _parabola_length(x), x)
     points = np.column_stack([px, 0 * px, front - 26.0 * px**2])

@@ -105,9 +105,7 @@ def outline(camera: Camera, vertices: FloatArray, faces: IntArray) -> BoolArray:
 
 def hair_pixels(hair: BoolArray, skin: BoolArray, metre: float) -> FloatArray:
     """(H, W) in [0, 1] how far pixels belong to hair: 0 where skin is nearer, by what hair and skin cover (H, W).
-
-    ``metre`` is the number of pixels of a metre at the head.
-    """
+    ``metre`` is the number of pixels of a metre at the head."""
     return np.clip((_distance(skin) - _distance(hair)) / max(_BETWEEN * metre, 1.0), 0.0, 1.0)
 
 
@@ -198,10 +196,8 @@ class CaptureRenderer:
         return sub_frames(moved, float(self._plan.cameras[FRONTAL].K[0, 0]), CAMERA_DISTANCE, shutter)
 
     def pose_at(self, sequence: str, timestep: int, offset: float = 0.0) -> None:
-        """Pose all meshes for a timestep, with the state of the skin that results from previous timesteps.
-
-        ``offset`` is the time from there in seconds: what moves in it is not the state of the skin.
-        """
+        """Pose all meshes for a timestep, with the state of the skin that results from previous timesteps. ``offset``
+        is the time from there in seconds: what moves in it is not the state of the skin."""
         plan, performed = self._plan, self._plan.performed[sequence]
         if sequence not in self._states:
             self._states[sequence] = over_time(performed.activations, performed.step, plan.person)
@@ -229,10 +225,8 @@ class CaptureRenderer:
     def render_view(
         self, view: Camera, seed: int, background: FloatArray | None = None
     ) -> tuple[ByteArray, ByteArray]:
-        """(H, W, 3) 8-bit image on a background (3,), by default the capture's, and (H, W) foreground mask, without motion in an exposure.
-
-        A camera that is not of the rig has no response of its own (`--camera-colour`).
-        """
+        """(H, W, 3) 8-bit image on a background (3,), by default the capture's, and (H, W) foreground mask, without
+        motion in an exposure. A camera that is not of the rig has no response of its own (`--camera-colour`)."""
         return self._developed(view, seed, *self._tracer.image(view, seed), background)
 
     def _developed(

@@ -41,10 +41,8 @@ class SkinPaint:
 def paint_skin(
     person: Person, anatomy: Anatomy, points: FloatArray, normals: FloatArray, cavity: FloatArray
 ) -> SkinPaint:
-    """Paint the fine skin points (N, 3) of a neutral subject.
-
-    ``normals`` (N, 3) point outwards; ``cavity`` (N,) is the share of each point in the mouth's wall.
-    """
+    """Paint the fine skin points (N, 3) of a neutral subject. ``normals`` (N, 3) point outwards; ``cavity`` (N,) is the
+    share of each point in the mouth's wall."""
     s, seed = anatomy.scale, person.seed
     color = np.tile(person.skin, (len(points), 1))
     red = person.skin * np.array([1.02, 0.66, 0.62])
@@ -304,10 +302,8 @@ def flush_strengths(a: Activations) -> FloatArray:
 def make_folds(
     person: Person, anatomy: Anatomy, points: FloatArray, lips: FloatArray, bare: FloatArray
 ) -> Folds:
-    """Define the folds on the neutral fine skin, (N, 3) points.
-
-    ``lips`` (N,) is the share of the lips' red; ``bare`` (N,) is 0 where hair hides the skin.
-    """
+    """Define the folds on the neutral fine skin, (N, 3) points. ``lips`` (N,) is the share of the lips' red; ``bare``
+    (N,) is 0 where hair hides the skin."""
     sketch = _Sketch(person, anatomy, points)
     groups = sketch.groups()
     height = np.stack([groups[name][0] for name in FOLDS]) * (person.lines * person.dynamics)

@@ -230,11 +230,8 @@ class LatePoses:
 
 
 class RenderedSubject:
-    """A subject's visible body over a head model.
-
-    ``shape``: (S,) identity coefficients. ``correctives``: Level of shapes of the skin that the head model lacks, see
-    `correctives`.
-    """
+    """A subject's visible body over a head model. ``shape``: (S,) identity coefficients. ``correctives``: Level of
+    shapes of the skin that the head model lacks, see `correctives`."""
 
     def __init__(
         self, person: Person, geometry: Geometry, shape: FloatArray, correctives: float = 0.0
@@ -317,9 +314,7 @@ class RenderedSubject:
         self, pose: HeadPose, activations: Activations, state: SkinState, late: LatePoses | None = None
     ) -> dict[str, PosedMesh]:
         """All meshes in a pose, with the tongue of the ``activations``, and wrinkles and colour of a state of skin.
-
-        Hair and the skin of the neck are drawn towards the ``late`` poses.
-        """
+        Hair and the skin of the neck are drawn towards the ``late`` poses."""
         tracked = self._shown(pose, activations)
         joints = self._joint_motions(pose)
         hair = _moved(joints[HEAD_JOINT], self._hair.vertices)

@@ -52,11 +52,8 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True)
 class VideoPictures:
-    """Files by frame number.
-
-    ``masks`` describes the masks, "" if there are none; ``solid`` is `Track.solid`. ``unused`` is the number of images without
-    a tracked frame.
-    """
+    """Files by frame number. ``masks`` describes the masks, "" if there are none; ``solid`` is `Track.solid`.
+    ``unused`` is the number of images without a tracked frame."""
 
     frames: Mapping[int, Picture]
     folder: Path
@@ -196,10 +193,8 @@ FOLDER, SUFFIX = "checkpoint", ".frame"
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """One timestep as a tracker found it, in this project's units and axes; the same for all trackers.
-
-    The head's root is at rest in the world of ``world_to_camera``: its motion is in the camera.
-    """
+    """One timestep as a tracker found it, in this project's units and axes; the same for all trackers. The head's root
+    is at rest in the world of ``world_to_camera``: its motion is in the camera."""
 
     file: Path
     number: int

@@ -58,10 +58,8 @@ class NormalEquations:
         self._rights[timestep] += flat.T @ slope.astype(jacobian.dtype).reshape(-1)
 
     def step(self, state: HeadState, prior: HeadPrior, damping: float = 1e-6) -> HeadState:
-        """The state after a step with the prior.
-
-        ``damping``: Fraction of the diagonal that is added to it (Levenberg-Marquardt).
-        """
+        """The state after a step with the prior. ``damping``: Fraction of the diagonal that is added to it
+        (Levenberg-Marquardt)."""
         split = self._split
         deviations = np.concatenate([prior.pose, prior.shape])
         free = deviations > 0
@@ -193,10 +191,8 @@ class Fitter:
         return HeadPrior(np.array([*ANGLE_SPREAD, *free, *coefficients]), shape)
 
     def start(self, shape: FloatArray | None = None) -> HeadState:
-        """A shape, by default the mean, in the rigid pose of the landmarks of one camera at each timestep.
-
-        Of the cameras that saw most landmarks it is the one whose pose fits the landmarks of all cameras best.
-        """
+        """A shape, by default the mean, in the rigid pose of the landmarks of one camera at each timestep. Of the
+        cameras that saw most landmarks it is the one whose pose fits the landmarks of all cameras best."""
         columns = PoseColumns.of(self.head)
         poses = np.zeros((len(self.landmarks.pixels), columns.size))
         shape = np.zeros(self.head.shape_basis.shape[2]) if shape is None else shape
@@ -276,9 +272,7 @@ class Fitter:
         progress: Progress = no_progress,
     ) -> Fitted:
         """Steps on colours of points and landmarks at the blurs of `LEVELS`, with or without optimising the shape.
-
-        ``stack`` holds the images of all timesteps, the cameras of each together.
-        """
+        ``stack`` holds the images of all timesteps, the cameras of each together."""
         vertices = sampled_vertices(self.head)
         rig = PointRig.at_vertices(self.head, vertices)
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))

@@ -187,9 +187,7 @@ def check_checkout(name: str, checkout: Path) -> None:
 
 def check_interpreter(name: str, python: str, option: str = "--python") -> Path:
     """Path of an interpreter with the modules of a program. Raises `InputError` if it or one of these is missing.
-
-    ``option`` is the one that names it, for messages.
-    """
+    ``option`` is the one that names it, for messages."""
     program = PROGRAMS[name]
     interpreter = shutil.which(python)
     if interpreter is None:
@@ -316,11 +314,8 @@ if TYPE_CHECKING:
 
 
 def track_with_program(settings: TrackSettings, progress: Progress) -> CommandResult:
-    """Run another tracker on the file of a video and convert its output to a capture.
-
-    Its files are in a folder of its name in ``settings.out``, the capture beside it. A repeated call resumes after the last
-    finished step.
-    """
+    """Run another tracker on the file of a video and convert its output to a capture. Its files are in a folder of its
+    name in ``settings.out``, the capture beside it. A repeated call resumes after the last finished step."""
     source, name = Path(settings.capture), settings.program
     if not is_video(source):
         raise InputError(source, "", f"the file of a video, for --with {name}", "something else")

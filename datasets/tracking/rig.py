@@ -101,11 +101,8 @@ class _Posed(NamedTuple):
 
 
 class PointRig:
-    """P points on a head model.
-
-    ``head``: Head model in FLAME's layout. ``corners``: (P, 3) vertices of each point. ``weights``: (P, 3) their shares,
-    rows sum to 1. ``dtype``: Type of the points and of the derivatives.
-    """
+    """P points on a head model. ``head``: Head model in FLAME's layout. ``corners``: (P, 3) vertices of each point.
+    ``weights``: (P, 3) their shares, rows sum to 1. ``dtype``: Type of the points and of the derivatives."""
 
     def __init__(self, head: HeadAsset, corners: IntArray, weights: FloatArray, dtype: Any = np.float32):
         def mixed(values: Any) -> FloatArray:

@@ -343,9 +343,7 @@ def _fit_block(
     progress: Progress,
 ) -> dict[str, np.ndarray]:
     """Fit some timesteps with a given or a newly estimated shape, from given poses or from those of the landmarks.
-
-    Returns the arrays of `_PART`.
-    """
+    Returns the arrays of `_PART`."""
     begin = time.perf_counter()
     fitter = Fitter(clip.head, views, landmarks)
     images = [clip.image(clip.frame_at[timestep, name]) for timestep in part for name in cameras]

@@ -12,10 +12,7 @@ from ..head.geometry import triangle_areas, vertex_normals
 
 
 class FrameStack:
-    """Images of N frames as one row of pixels.
-
-    ``images``: (H, W, 3) 8-bit images; sizes may differ.
-    """
+    """Images of N frames as one row of pixels. ``images``: (H, W, 3) 8-bit images; sizes may differ."""
 
     def __init__(self, images: list[ByteArray]):
         self._images = images
@@ -25,10 +22,8 @@ class FrameStack:
         self._pixels = np.zeros((int(self._starts[-1]), 3), np.int16)
 
     def filter(self, sigma: float, wide: float = 0.0) -> None:
-        """Blur the sampled images by ``sigma`` pixels, and subtract their blur by ``wide``; 0 for none.
-
-        The difference contains less of slow changes such as shading, which turns with the head.
-        """
+        """Blur the sampled images by ``sigma`` pixels, and subtract their blur by ``wide``; 0 for none. The difference
+        contains less of slow changes such as shading, which turns with the head."""
         for start, image in zip(self._starts, self._images):
             levels: FloatArray = np.asarray(image * np.float32(_LEVELS / 255), np.float32)
             if sigma > 0:
@@ -40,9 +35,7 @@ class FrameStack:
 
     def sample(self, frames: IntArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Values (n, 3), 1 being white, and gradients (n, 3, 2) per pixel at places (n, 2) of frames (n,), bilinear.
-
-        Places outside an image take its border.
-        """
+        Places outside an image take its border."""
         sizes = self.sizes[frames]
         place = np.clip(pixels - 0.5, 0, sizes - 1.001)
         corner = place.astype(np.int64)
@@ -90,10 +83,7 @@ class Projection(NamedTuple):
 
 
 class Views:
-    """C cameras.
-
-    ``cameras``: Cameras of any sizes.
-    """
+    """C cameras. ``cameras``: Cameras of any sizes."""
 
     def __init__(self, cameras: Sequence[Camera]):
         self.cameras = [*cameras]
@@ -154,10 +144,8 @@ class Occlusion:
             self._samples.append((corners[number == steps], shares))
 
     def visible(self, mesh: FloatArray, vertices: IntArray) -> FloatArray:
-        """(C, n) cosine between normal and direction to the camera at vertices that are seen, else 0.
-
-        ``mesh``: (V, 3) posed mesh, metres. ``vertices``: (n,) vertices.
-        """
+        """(C, n) cosine between normal and direction to the camera at vertices that are seen, else 0. ``mesh``: (V, 3)
+        posed mesh, metres. ``vertices``: (n,) vertices."""
         normals = vertex_normals(mesh, self._faces)[vertices]
         points = mesh[vertices]
         toward = self._views.centers[:, None] - points

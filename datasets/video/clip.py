@@ -73,10 +73,8 @@ class Background(NamedTuple):
     """(H, W) minimum difference of foreground, levels."""
 
     def mask(self, image: ByteArray, face: FloatArray) -> HeadMask:
-        """The mask of an (H, W, 3) image of the same view with the landmarks ``face``, (L, 2) pixels.
-
-        It is the connected part of the difference that holds the face, without holes, and ends `BELOW` the chin as crops do.
-        """
+        """The mask of an (H, W, 3) image of the same view with the landmarks ``face``, (L, 2) pixels. It is the
+        connected part of the difference that holds the face, without holes, and ends `BELOW` the chin as crops do."""
         hull = np.zeros(image.shape[:2], np.uint8)
         cv2.fillConvexPoly(hull, cv2.convexHull(np.rint(face).astype(np.int32)), 1)
         inside, bottom = hull.astype(bool), float(face[:, 1].max())
@@ -106,9 +104,7 @@ class Background(NamedTuple):
 
 def learn_background(path: Path, images: Sequence[ByteArray]) -> Background:
     """The median of each pixel over frames that do not show a face, most of which have to show the empty room.
-
-    ``path``: The video, for messages. ``images``: Images (H, W, 3) of one view.
-    """
+    ``path``: The video, for messages. ``images``: Images (H, W, 3) of one view."""
     if len(images) < LEAST_EMPTY:
         expected = f"at least {LEAST_EMPTY} frames that show nobody's face, {_USE}"
         raise InputError(path, "", expected, f"{len(images)}", _REMEDY)
@@ -303,10 +299,8 @@ def open_video(
     out: Path,
     progress: Progress = no_progress,
 ) -> VideoClip:
-    """Read a video, write its frames and masks under ``out``, and return them as a clip in a neutral pose.
-
-    Files that an earlier call with the same video and options wrote there are reused.
-    """
+    """Read a video, write its frames and masks under ``out``, and return them as a clip in a neutral pose. Files that
+    an earlier call with the same video and options wrote there are reused."""
     subject = options.subject or subject_of(path)
     check_subject(subject, "--subject")
     info = probe_video(path)

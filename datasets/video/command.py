@@ -47,10 +47,8 @@ class OpenedVideo(NamedTuple):
 
 
 def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) -> OpenedVideo:
-    """The clip of a video with its focal length.
-
-    Its frames and results are stored in ``folder``, from which a later call resumes.
-    """
+    """The clip of a video with its focal length. Its frames and results are stored in ``folder``, from which a later
+    call resumes."""
     path = Path(settings.capture)
     named = settings.head or EMBEDDED
     head = target_head(named, "--head")

@@ -125,10 +125,8 @@ def _overlap(first: FloatArray, second: FloatArray) -> float:
 
 
 class FaceFinder:
-    """The landmark network in a file, and the detector in the file beside it or else the one that was fetched.
-
-    Raises as both.
-    """
+    """The landmark network in a file, and the detector in the file beside it or else the one that was fetched. Raises
+    as both."""
 
     def __init__(self, landmarks: Path):
         beside, fetched = (
@@ -246,10 +244,8 @@ class FaceFollower:
     """(COUNT, 2) landmarks of every other face of the latest frame."""
 
     def follow(self, image: ByteArray, time: float, search: bool) -> FloatArray | None:
-        """The person's landmarks in the next frame, (COUNT, 2) pixels, or None.
-
-        ``time``: Of the frame, seconds. ``search``: Whether to search for further faces even if the person's is found.
-        """
+        """The person's landmarks in the next frame, (COUNT, 2) pixels, or None. ``time``: Of the frame, seconds.
+        ``search``: Whether to search for further faces even if the person's is found."""
         own = None if self.lost or self.last is None else self._near(image, self.last)
         others: list[FloatArray] = []
         for before in self.others:

@@ -202,10 +202,7 @@ def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
 
 def surface_graph(vertices: FloatArray, faces: IntArray, size: FloatArray, *, diagonals: bool) -> csr_matrix:
     """Edges of the mesh, optionally with the short diagonals across them, weighted by length relative to the target
-    length.
-
-    Diagonals make distances more even in all directions, but let one cluster leap over another.
-    """
+    length. Diagonals make distances more even in all directions, but let one cluster leap over another."""
     edges = mesh_edges(faces)
     opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
     key = np.sort(edges, axis=1)

@@ -40,10 +40,8 @@ def canthal_height(x: FloatArray | float) -> FloatArray | float:
 
 
 def lid_curves(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Heights of the upper and lower lid margin above the centre of the eye, at ``x`` from the centre.
-
-    The curves cross at the canthi, so that the aperture closes.
-    """
+    """Heights of the upper and lower lid margin above the centre of the eye, at ``x`` from the centre. The curves cross
+    at the canthi, so that the aperture closes."""
     middle = (MEDIAL_CANTHUS + LATERAL_CANTHUS) / 2
     half = (LATERAL_CANTHUS - MEDIAL_CANTHUS) / 2
     u = (x - middle) / half

@@ -225,10 +225,8 @@ def _search(
 
 
 def _on_triangles(points: FloatArray, corners: FloatArray) -> FloatArray:
-    """(..., 3) barycentric weights of the points of triangles (..., 3, 3) closest to points (..., 3).
-
-    This is the foot in the plane if it is inside, else the nearest of the closest points on the three edges.
-    """
+    """(..., 3) barycentric weights of the points of triangles (..., 3, 3) closest to points (..., 3). This is the foot
+    in the plane if it is inside, else the nearest of the closest points on the three edges."""
     a, b, c = np.moveaxis(corners, -2, 0)
     ab, ac, ap = b - a, c - a, points - a
     aa, cc, cross = (ab * ab).sum(-1), (ac * ac).sum(-1), (ab * ac).sum(-1)

@@ -116,11 +116,8 @@ class FitProblem:
         self._terms = self._gram_terms()
 
     def frames(self, targets: FloatArray, necks: FloatArray) -> list[FrameTerms]:
-        """Reduce the targets of T timesteps.
-
-        ``targets``: (T, n, 3) metres, in the frame of the head. ``necks``: (T, 3, 3) rotations of the neck joint; used only if
-        the settings keep them.
-        """
+        """Reduce the targets of T timesteps. ``targets``: (T, n, 3) metres, in the frame of the head. ``necks``: (T, 3,
+        3) rotations of the neck joint; used only if the settings keep them."""
         wanted = _MILLIMETRES * np.asarray(targets, dtype=np.float64)
         weighted = wanted * self._share[:, None]
         count, size = len(wanted), self._plain.shape[2]
@@ -180,10 +177,8 @@ class FitProblem:
         return self._skinned(frame, bends, np.concatenate([coefficients, self._fixed(frame, bends)]))
 
     def directions(self, frame: FrameTerms, angles: FloatArray) -> FloatArray:
-        """(n, 3, E + L) derivatives of the fitted vertices by the coefficients at angles (9,), metres.
-
-        This is the dense matrix that `evaluate` avoids, for checks and for solvers that need it.
-        """
+        """(n, 3, E + L) derivatives of the fitted vertices by the coefficients at angles (9,), metres. This is the
+        dense matrix that `evaluate` avoids, for checks and for solvers that need it."""
         bends = matrices_and_derivatives(angles.reshape(-1, 3))[0] - np.eye(3)
         size = self._plain.shape[2]
         return self._skinned(frame, bends, np.eye(size)[:, : self._free_size])
@@ -344,11 +339,8 @@ def angle_bounds(settings: RefitSettings) -> FloatArray:
 def solve_frame(
     problem: FitProblem, frame: FrameTerms, start: FloatArray, fixed: FloatArray, settings: RefitSettings
 ) -> Solution:
-    """Fit one timestep.
-
-    ``start``: (9,) initial angles, such as the previous timestep's. ``fixed``: (9,) values of the angles that move no
-    vertex with a target, which are not optimised.
-    """
+    """Fit one timestep. ``start``: (9,) initial angles, such as the previous timestep's. ``fixed``: (9,) values of the
+    angles that move no vertex with a target, which are not optimised."""
     searched, limit = problem.searched, angle_bounds(settings)
     scale = problem.scale[searched]
     best: list[Solution] = []

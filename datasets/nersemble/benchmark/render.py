@@ -67,10 +67,8 @@ class BenchmarkSequence:
 def read_sequence(
     data: Path, track: BenchmarkTrack, participant: str, sequence: str, head: HeadArrays
 ) -> BenchmarkSequence:
-    """Read cameras and tracking of a sequence from the benchmark's folder.
-
-    ``head``: FLAME 2023 with or without teeth; coefficients are padded with zeros to its bases.
-    """
+    """Read cameras and tracking of a sequence from the benchmark's folder. ``head``: FLAME 2023 with or without teeth;
+    coefficients are padded with zeros to its bases."""
     path = tracking_file(data, participant, sequence)
     arrays = read_arrays(path, MEMBERS)
     for name, values in arrays.items():

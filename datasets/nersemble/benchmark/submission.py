@@ -61,10 +61,8 @@ class BenchmarkTrack:
     """Published number of frames of all sequences of a participant together."""
 
     def videos(self, data: Path | None = None) -> Iterator[Video]:
-        """All videos of a submission.
-
-        ``data`` is the benchmark's folder; its tracking gives the number of frames if that is not published.
-        """
+        """All videos of a submission. ``data`` is the benchmark's folder; its tracking gives the number of frames if
+        that is not published."""
         for participant, sequences in self.sequences.items():
             for sequence, frames in sequences.items():
                 count = frames

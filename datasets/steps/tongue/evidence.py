@@ -81,10 +81,8 @@ def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> MouthEvidence:
 
 
 def mouth_patch(strength: FloatArray, atlas: MouthAtlas) -> np.ndarray:
-    """(H, W) the largest connected patch of covered pixels that begins at the mouth's opening.
-
-    The region between the patch and the opening belongs to it, since a tongue comes out of the mouth.
-    """
+    """(H, W) the largest connected patch of covered pixels that begins at the mouth's opening. The region between the
+    patch and the opening belongs to it, since a tongue comes out of the mouth."""
     labels, count = ndimage.label((strength > LOOKS) & atlas.below, np.ones((3, 3)))
     opening = atlas.below & (atlas.height > -CONNECTED) & (atlas.lips & atlas.below).any(axis=0)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
@@ -178,11 +176,8 @@ def decide(
     threshold: float | None,
     overrides: Mapping[int, str],
 ) -> Exclusions:
-    """Decide every timestep.
-
-    ``timesteps``: Sequence by timestep, in the order of the evidence. ``threshold``: mm²; None chooses one automatically.
-    ``overrides``: Manual decisions, see `Exclusions`.
-    """
+    """Decide every timestep. ``timesteps``: Sequence by timestep, in the order of the evidence. ``threshold``: mm²;
+    None chooses one automatically. ``overrides``: Manual decisions, see `Exclusions`."""
     basis = "given"
     if threshold is None:
         threshold, basis = choose_threshold(evidence.areas)

@@ -221,10 +221,8 @@ def posed_meshes(clip: Clip, timesteps: Sequence[int]) -> Iterator[tuple[int, Fl
 def sample_clip(
     clip: Clip, atlas: MouthAtlas, cameras: Sequence[str], progress: Progress = no_progress
 ) -> MouthColours:
-    """Sample every timestep of a clip in the given cameras; each image is read once.
-
-    Memory: the result (20 kB per timestep and camera for a map of 50 x 50) and a few images at a time.
-    """
+    """Sample every timestep of a clip in the given cameras; each image is read once. Memory: the result (20 kB per
+    timestep and camera for a map of 50 x 50) and a few images at a time."""
     frames = frames_by_timestep(clip)
     timesteps = [t for t, keys in frames.items() if any(camera in keys for camera in cameras)]
     height, width = atlas.inside.shape
@@ -252,11 +250,8 @@ def sample_clip(
 def sample_image(
     image: ByteArray, camera: Camera, atlas: MouthAtlas, vertices: FloatArray
 ) -> tuple[ByteArray, np.ndarray]:
-    """Colours (H, W, 3) of the map's points in one image, and where (H, W) they are seen.
-
-    A point is seen where it faces the camera within 62 degrees, lies in the picture and no triangle of the
-    tracked mesh is in front of it.
-    """
+    """Colours (H, W, 3) of the map's points in one image, and where (H, W) they are seen. A point is seen where it
+    faces the camera within 62 degrees, lies in the picture and no triangle of the tracked mesh is in front of it."""
     colours = np.zeros((*atlas.inside.shape, 3), np.uint8)
     seen = np.zeros(atlas.inside.shape, bool)
     points = atlas.points(vertices)
@@ -286,10 +281,8 @@ def sample_image(
 
 
 def _crop(image: ByteArray, camera: Camera, pixels: FloatArray, depth: float) -> tuple[ByteArray, Camera]:
-    """The image around points (N, 2), reduced by area to about the map's pitch, and the camera that took it.
-
-    Finer images are reduced to avoid sampling noise and pores.
-    """
+    """The image around points (N, 2), reduced by area to about the map's pitch, and the camera that took it. Finer
+    images are reduced to avoid sampling noise and pores."""
     factor = max(1, round(float(PITCH * camera.K[0, 0] / depth)))
     size = np.array([camera.width, camera.height])
     low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - _MARGIN * factor, 0, size)
