@@ -208,11 +208,11 @@ def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
         spec: DatasetSpec = get("datasets", name)
         return spec
     root = Path(path)
-    known = readers()
-    expected = f"a capture that a reader knows ({', '.join(known)})"
+    specs = readers()
+    expected = f"a capture that a reader knows ({', '.join(specs)})"
     if not root.exists():
         raise InputError(root, "", expected, "no such file or folder")
-    fitting = [spec for spec in known.values() if finds(spec, root)]
+    fitting = [spec for spec in specs.values() if finds(spec, root)]
     if not fitting:
         raise InputError(root, "", expected, *describe(root))
     if len(fitting) > 1:
@@ -238,8 +238,8 @@ def open_clips(
     from ..bench.engine.captures import found_captures  # slow to import
 
     spec = find_reader(path, reader)
-    known = inspect.signature(resolve(spec.implementation)).parameters
-    given = {key: value for key, value in (wishes or {}).items() if key in known}
+    parameters = inspect.signature(resolve(spec.implementation)).parameters
+    given = {key: value for key, value in (wishes or {}).items() if key in parameters}
     given |= settings or {}
     for _, read in found_captures(spec, Path(path), given):
         yield as_capture(read(progress))

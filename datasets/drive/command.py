@@ -282,8 +282,10 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
         sizes = {(camera.width, camera.height) for camera in scene.clip.cameras.values()}
         if is_video and any(side % 2 for size in sizes for side in size):
             remedy = "Write a folder, or leave out --capture."
-            shown = " and ".join(f"{width}x{height}" for width, height in sizes)
-            raise InputError("command line", "--capture", "a camera of even size, for a video", shown, remedy)
+            size_text = " and ".join(f"{width}x{height}" for width, height in sizes)
+            raise InputError(
+                "command line", "--capture", "a camera of even size, for a video", size_text, remedy
+            )
         start = time.perf_counter()
         request = SignalRequest(
             Path(settings.signal),
@@ -401,9 +403,9 @@ def report_text(data: dict[str, Any]) -> str:
     ]
     if filled:
         count = sum(last - first + 1 for first, last in filled)
-        shown = ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last in filled)
+        ranges = ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last in filled)
         what = f"{count} of {data['frames']} frames, without a face or missing in the signal"
-        lines.insert(2, f"  interpolated    {what}: {shown}")
+        lines.insert(2, f"  interpolated    {what}: {ranges}")
     reasons: dict[str, list[str]] = {}
     for channel, reason in data["unused"].items():
         reasons.setdefault(reason, []).append(channel)

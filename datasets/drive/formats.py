@@ -214,8 +214,8 @@ def _coefficients(source: Path, head: HeadArrays, sums: Mapping[str, FloatArray]
         elif match and int(match[2]) < sizes.get(match[1], 0):
             parts[match[1]][:, int(match[2])] += values
         else:
-            known = [f"{part}.{n}" for part, size in sizes.items() for n in range(size)]
-            raise unknown(str(source), "coefficients", name, [*named, *known])
+            coefficients = [f"{part}.{n}" for part, size in sizes.items() for n in range(size)]
+            raise unknown(str(source), "coefficients", name, [*named, *coefficients])
     return parts
 
 
@@ -264,8 +264,8 @@ def read_signal(request: SignalRequest, name: str = "") -> DrivingSignal:
     path = request.path
     if not path.exists():
         raise InputError(path, "", "a signal", "no such file or folder")
-    known = readers().values() if path.is_dir() else ()
-    if name == "capture" or (not name and not request.map and any(finds(spec, path) for spec in known)):
+    specs = readers().values() if path.is_dir() else ()
+    if name == "capture" or (not name and not request.map and any(finds(spec, path) for spec in specs)):
         return read_capture_signal(request)
     if request.sequence:
         raise InputError("command line", "--sequence", "a signal that is a capture", str(path))

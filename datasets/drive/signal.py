@@ -196,11 +196,11 @@ def is_blendshapes(table: SignalTable) -> bool:
 
 def read_blendshapes(request: SignalRequest) -> DrivingSignal:
     """Blendshapes of each frame with a face."""
-    known = {name: arkit_name(name) for name in request.columns.columns}
-    table = request.columns.with_face([name for name, arkit in known.items() if arkit])
+    arkit_names = {name: arkit_name(name) for name in request.columns.columns}
+    table = request.columns.with_face([name for name, arkit in arkit_names.items() if arkit])
     unused = {}
     for name in table.columns:
-        if not known[name] and name != table.timing.column:
+        if not arkit_names[name] and name != table.timing.column:
             similar = get_close_matches(name.lower(), [*_SPELLINGS], 1, MISSPELT)
             if similar:
                 expected = f"ARKit's name {_SPELLINGS[similar[0]]}"
@@ -208,7 +208,7 @@ def read_blendshapes(request: SignalRequest) -> DrivingSignal:
                 raise InputError(table.path, "columns", expected, repr(name), remedy)
             unused[name] = "no blendshape"
     channels: dict[str, FloatArray] = {}
-    for name, arkit in known.items():
+    for name, arkit in arkit_names.items():
         if arkit:
             if arkit in channels:
                 raise InputError(table.path, "columns", f"one column for {arkit}", "two")

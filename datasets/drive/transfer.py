@@ -188,12 +188,12 @@ def resampled(
     rotations = rotation_of(np.array([pose.rotation for pose in poses]))
     turns = (rotations[before].inv() * rotations[after]).as_rotvec()
     columns["rotation"] = (rotations[before] * rotation_of(share * turns)).as_rotvec()
-    made = [
+    converted = [
         replace(poses[row], **{name: values[number] for name, values in columns.items()})
         for number, row in enumerate(before)
     ]
     filled = np.flatnonzero(np.diff(nearest > GAP / 2, prepend=False, append=False)).reshape(-1, 2)
-    return made, [(int(first), int(end) - 1) for first, end in filled]
+    return converted, [(int(first), int(end) - 1) for first, end in filled]
 
 
 def window_length(frames: int, seconds: float, fps: float) -> int:

@@ -219,8 +219,8 @@ class _FrameReader:
         return InputError(self._path, f"{self._where}.{key}", expected, found_entry(self._get(key)))
 
     def _get(self, key: str) -> Any:
-        own = self._frame.get(key)
-        return self._document.get(key) if own is None else own
+        value = self._frame.get(key)
+        return self._document.get(key) if value is None else value
 
     def text(self, key: str) -> str:
         value = self._frame.get(key)

@@ -136,9 +136,9 @@ def content_digests(
     """
     paths = sorted(set(files))
     place = _place(cached_for) if cached_for else None
-    known = _read_cache(place) if place else {}
+    cached = _read_cache(place) if place else {}
     stamps = {path: Stamp.of(path) for path in paths}
-    result = {path: known[_name(stamps[path])] for path in paths if _name(stamps[path]) in known}
+    result = {path: cached[_name(stamps[path])] for path in paths if _name(stamps[path]) in cached}
     missing = [path for path in paths if path not in result]
     with ThreadPoolExecutor(_THREADS) as pool:
         for done, (path, value) in enumerate(zip(missing, pool.map(digest_content, missing)), start=1):

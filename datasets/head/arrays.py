@@ -230,14 +230,14 @@ def with_derived_regions(head: HeadArrays) -> HeadArrays:
     Regions are derived only if all inputs exist and they are not given already; those that VHAP defines as vertex
     lists (irises, lip rings, ...) cannot be derived.
     """
-    known = dict(head.regions)
+    regions = dict(head.regions)
 
     def add(name: str, inputs: tuple[str, ...], members: IntArray) -> None:
-        if name not in known and all(source in known for source in inputs):
-            known[name] = np.unique(members)
+        if name not in regions and all(source in regions for source in inputs):
+            regions[name] = np.unique(members)
 
     def union(*names: str) -> IntArray:
-        return np.concatenate([np.empty(0, np.int64), *(known[name] for name in names if name in known)])
+        return np.concatenate([np.empty(0, np.int64), *(regions[name] for name in names if name in regions)])
 
     for name, parts in (
         ("ears", ("left_ear", "right_ear")),
@@ -249,7 +249,7 @@ def with_derived_regions(head: HeadArrays) -> HeadArrays:
     add("hair", ("scalp", "face", "neck"), np.setdiff1d(union("scalp"), union("face", "neck")))
     bare = union("eyeballs", "hair", "lips", "teeth", "boundary")
     add("skin", ("eyeballs", "hair", "lips"), np.setdiff1d(np.arange(len(head.template)), bare))
-    return replace(head, regions=known)
+    return replace(head, regions=regions)
 
 
 def region(head: HeadAsset, name: str) -> IntArray:

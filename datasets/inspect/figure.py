@@ -120,9 +120,9 @@ def _draw_rigs(figure: SubFigure, clip: CaptureClip, splits: Sequence[SplitRow])
     ]
     labels = ["", "images", "timesteps", "cameras", "sequences"]
     widths = [0.3, 0.16, 0.19, 0.16, 0.19]
-    shown = table.table(cells, colLabels=labels, colWidths=widths, loc="upper left", edges="B")
-    shown.auto_set_font_size(False)
-    for (row, _), cell in shown.get_celld().items():
+    drawn = table.table(cells, colLabels=labels, colWidths=widths, loc="upper left", edges="B")
+    drawn.auto_set_font_size(False)
+    for (row, _), cell in drawn.get_celld().items():
         cell.set_edgecolor("white")
         if row and splits[row - 1].split != "excluded":
             cell.set_text_props(color=TRAIN if splits[row - 1].split == "train" else HELD_OUT)
@@ -213,8 +213,8 @@ def _head_picture(head: FloatArray, faces: IntArray) -> ByteArray:
     away = np.eye(4)
     away[2, 3] = _FAR_M
     camera = Camera("panel", width, height, intrinsics, away)
-    shown = rasterize_mesh(head, faces, camera).face >= 0
-    return np.dstack([draw_mesh(head, faces, camera), np.where(shown, 255, 0).astype(np.uint8)])
+    covered = rasterize_mesh(head, faces, camera).face >= 0
+    return np.dstack([draw_mesh(head, faces, camera), np.where(covered, 255, 0).astype(np.uint8)])
 
 
 def _short_names(names: list[str]) -> dict[str, str]:
@@ -371,8 +371,8 @@ def _draw_motion(
 
 def _draw_sequences(jaw: Axes, reach: Axes, rows: Sequence[SequenceRow]) -> None:
     """Ranges of each sequence as bars from minimum to maximum, with a mark at the median."""
-    shown = rows if len(rows) <= MAX_SEQUENCES else rows[: MAX_SEQUENCES - 1]
-    for place, row in enumerate(shown):
+    visible = rows if len(rows) <= MAX_SEQUENCES else rows[: MAX_SEQUENCES - 1]
+    for place, row in enumerate(visible):
         colour = HELD_OUT if row.held_out else TRAIN
         for axes, (low, typical, high) in ((jaw, row.jaw_deg), (reach, (0.0, *row.reach_mm))):
             axes.barh(place, high - low, left=low, height=0.5, color=colour, alpha=0.5)
@@ -383,18 +383,18 @@ def _draw_sequences(jaw: Axes, reach: Axes, rows: Sequence[SequenceRow]) -> None
     labels = [
         f"{shortened(row.sequence, 24)}, {row.timesteps}"
         + (f" (+{row.excluded} excl.)" if row.excluded else "")
-        for row in shown
+        for row in visible
     ]
-    jaw.set_yticks(range(len(shown)), labels)
-    for text, row in zip(jaw.get_yticklabels(), shown):
+    jaw.set_yticks(range(len(visible)), labels)
+    for text, row in zip(jaw.get_yticklabels(), visible):
         text.set_color(HELD_OUT if row.held_out else TRAIN)
     reach.set_yticks([])
     for axes, label in ((jaw, "jaw, degrees"), (reach, "expression, mm")):
-        axes.set_ylim(max(len(shown), 4) - 0.4, -0.6)
+        axes.set_ylim(max(len(visible), 4) - 0.4, -0.6)
         axes.set_xlim(left=0)
         axes.set_xlabel(label)
         axes.grid(axis="x")
-    more = f" (and {len(rows) - len(shown)} more)" if len(shown) < len(rows) else ""
+    more = f" (and {len(rows) - len(visible)} more)" if len(visible) < len(rows) else ""
     jaw.set_title(f"motion by sequence, timesteps{more}")
     reach.set_title("head, most", loc="right", fontsize=9, color=MUTED)
 

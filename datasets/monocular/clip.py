@@ -125,16 +125,16 @@ def fix_camera(
     for index, (frame, root) in enumerate(zip(frames, roots)):
         motion = back @ frame.camera.world_to_camera if index else np.eye(4)
         turn = Rotation.from_matrix(motion[:3, :3])
-        own = frame.pose
+        pose = frame.pose
         poses[index] = HeadPose(
-            head_model=own.head_model,
-            expression=own.expression,
-            rotation=(turn * rotation_of(own.rotation)).as_rotvec(),
-            neck=own.neck,
-            jaw=own.jaw,
-            eyes=own.eyes,
-            translation=turn.apply(root + own.translation) + motion[:3, 3] - root,
-            eyelids=own.eyelids,
+            head_model=pose.head_model,
+            expression=pose.expression,
+            rotation=(turn * rotation_of(pose.rotation)).as_rotvec(),
+            neck=pose.neck,
+            jaw=pose.jaw,
+            eyes=pose.eyes,
+            translation=turn.apply(root + pose.translation) + motion[:3, 3] - root,
+            eyelids=pose.eyelids,
             subject=subject,
             timestep=index,
         )

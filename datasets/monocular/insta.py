@@ -370,25 +370,25 @@ class _Meshes:
         )
         jaw = self._rotations(self._root / "flame/jaw" / f"{stem}.txt", 1)
         eyes = self._rotations(self._root / "flame/eyes" / f"{stem}.txt", 2)
-        known: FloatArray | None = None if jaw is None or eyes is None else np.concatenate([jaw, eyes])
+        angles: FloatArray | None = None if jaw is None or eyes is None else np.concatenate([jaw, eyes])
         lids: FloatArray | None = None
-        if known is None or head.eyelid_basis is not None or source.number in self._compared:
-            if known is not None and not source.mesh.is_file():
+        if angles is None or head.eyelid_basis is not None or source.number in self._compared:
+            if angles is not None and not source.mesh.is_file():
                 lids = None if head.eyelid_basis is None else np.zeros(2)
             else:
                 mesh = read_vertices(source.mesh, len(head.template))
                 self.files.add(source.mesh)
-                found = self._fit.fit_pose(mesh, self._neutral + self._expressions @ expression, known)
+                found = self._fit.fit_pose(mesh, self._neutral + self._expressions @ expression, angles)
                 check_distance(source.mesh, found.distance, head.version)
                 self._farthest, self._read = max(self._farthest, found.distance), self._read + 1
-                self._fitted += known is None
-                known = found.turns
+                self._fitted += angles is None
+                angles = found.turns
                 lids = found.lids if len(found.lids) else None
                 self._missed = max(self._missed, found.farthest)
                 self._closed = max(self._closed, float(found.lids.max(initial=0.0)))
-        assert known is not None, "fitted where it was not given"
+        assert angles is not None, "fitted where it was not given"
         rest = np.zeros(3)
-        return HeadPose(head.version, expression, rest, rest, known[:3], known[3:], rest, lids)
+        return HeadPose(head.version, expression, rest, rest, angles[:3], angles[3:], rest, lids)
 
     def notes(self) -> dict[str, Any]:
         """Source of the poses."""

@@ -107,10 +107,10 @@ def participants(root: Path) -> dict[str, Participant]:
 
 def participant(root: Path, subject: str) -> Participant:
     """One participant, with calibration."""
-    known = participants(root)
-    if subject not in known:
-        raise InputError(root, "subject", f"one out of {', '.join(known)}", subject)
-    one = known[subject]
+    by_id = participants(root)
+    if subject not in by_id:
+        raise InputError(root, "subject", f"one out of {', '.join(by_id)}", subject)
+    one = by_id[subject]
     if not one.calibration_file.exists():
         expected = "the calibration of the cameras"
         raise InputError(one.calibration_file, "", expected, "no such file", "Download calibrations.")

@@ -218,12 +218,12 @@ class PanelTracer:
         pixels = np.zeros((camera.height, camera.width, 4))
         rows, columns = window(camera, self._corners)
         if rows.start < rows.stop and columns.start < columns.stop:
-            part = np.zeros((rows.stop - rows.start, columns.stop - columns.start, 4), np.float32)
+            tile = np.zeros((rows.stop - rows.start, columns.stop - columns.start, 4), np.float32)
             world.render(
                 _rays(camera),
-                *(columns.start, rows.start, self._grid, _taps(self._grid), seed, part, self._threads),
+                *(columns.start, rows.start, self._grid, _taps(self._grid), seed, tile, self._threads),
             )
-            pixels[rows, columns] = part
+            pixels[rows, columns] = tile
         alpha = np.clip(pixels[..., 3], 0.0, 1.0)
         return pixels[..., :3] / np.maximum(pixels[..., 3:], 1e-6) * (alpha[..., None] > 0), alpha
 

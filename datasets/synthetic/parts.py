@@ -300,14 +300,16 @@ class TrackedPart:
 
 def tracked_parts(head: HeadAsset) -> tuple[TrackedPart, ...]:
     """Teeth and gums that belong to the tracked mesh."""
-    made = []
+    parts = []
     for region, (color, material) in _TRACKED.items():
         if region not in head.regions:
             continue
         faces = head.faces[np.isin(head.faces, head.regions[region]).all(axis=1)]
         used, local = np.unique(faces, return_inverse=True)
-        made.append(TrackedPart(region, used, local.reshape(-1, 3), np.tile(color, (len(used), 1)), material))
-    return tuple(made)
+        parts.append(
+            TrackedPart(region, used, local.reshape(-1, 3), np.tile(color, (len(used), 1)), material)
+        )
+    return tuple(parts)
 
 
 def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
@@ -351,11 +353,11 @@ def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
 def procedural_parts(person: Person, head: HeadAsset, shape: FloatArray) -> tuple[MouthPart, ...]:
     """Teeth, gums and tongue that come with the procedural head, for a subject's identity (S,)."""
     colors = {"teeth": _TEETH, "gums": _GUMS, "tongue": _TONGUE}
-    made = []
+    rows = []
     for part, out in zip(render_parts(head, shape), render_parts(head, shape, tongue_out=1.0)):
         mottled = 1.0 + 0.08 * value_noise(part.vertices / 0.0014, person.seed + 95)
         albedo = colors[part.material] * mottled[:, None]
-        made.append(
+        rows.append(
             MouthPart(
                 part.name,
                 part.vertices,
@@ -366,7 +368,7 @@ def procedural_parts(person: Person, head: HeadAsset, shape: FloatArray) -> tupl
                 part.material,
             )
         )
-    return tuple(made)
+    return tuple(rows)
 
 
 HIDES = 20e-6

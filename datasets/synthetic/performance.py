@@ -368,8 +368,8 @@ def perform(
         moments = _moments(name, timesteps, seconds, begin())
 
     def curves(time: FloatArray) -> Curves:
-        made = _natural_curves if kind == "natural" else _smooth_curves
-        values = made(name, time, seconds, begin())
+        make_curves = _natural_curves if kind == "natural" else _smooth_curves
+        values = make_curves(name, time, seconds, begin())
         values |= {control: np.zeros(len(time)) for control in CONTROLS if control not in values}
         # Lids follow the eyes down.
         for side in SIDES:

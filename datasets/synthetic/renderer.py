@@ -250,9 +250,9 @@ class CaptureRenderer:
         """(H, W) in [0, 1] how far pixels belong to hair on the head in the present pose."""
         skin, locks = (self._posed[name].vertices for name in ("skin", "hair"))
         faces = self._fixed["skin"].faces
-        grown = self._subject.hair_share[faces].mean(axis=1) > 0.5
-        hair = outline(view, locks, self._fixed["hair"].faces) | outline(view, skin, faces[grown])
-        return hair_pixels(hair, outline(view, skin, faces[~grown]), float(view.K[0, 0]) / CAMERA_DISTANCE)
+        hairy = self._subject.hair_share[faces].mean(axis=1) > 0.5
+        hair = outline(view, locks, self._fixed["hair"].faces) | outline(view, skin, faces[hairy])
+        return hair_pixels(hair, outline(view, skin, faces[~hairy]), float(view.K[0, 0]) / CAMERA_DISTANCE)
 
     def _activations(self, sequence: str, timestep: int, offset: float) -> Activations:
         performed = self._plan.performed[sequence]
@@ -291,12 +291,12 @@ class SyntheticTruth:
         self._settings = _settings(clip)
         KERNEL.load()
         self._geometry = load_geometry(self._settings.head)
-        made = self._geometry.head.version
-        if clip.head.version != made:
+        version = self._geometry.head.version
+        if clip.head.version != version:
             raise UnavailableError(
-                f"The clip has poses of {clip.head.version}; the true person is rendered in poses of {made}.",
+                f"The clip has poses of {clip.head.version}; the true person is rendered in poses of {version}.",
                 "Make the capture with that head model (`headbench synth --head`).",
-                f"poses are of {clip.head.version}, the truth is of {made}",
+                f"poses are of {clip.head.version}, the truth is of {version}",
             )
         self.fingerprint = digest(
             asdict(self._settings), EDITION, clip.subject, self._geometry.head.fingerprint(), self._background

@@ -323,14 +323,14 @@ class _Sketch:
         self._front = cKDTree(points)
 
     def groups(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        made = self._forehead() | {"glabella": self._glabella(), "bunny": self._bunny()}
-        made |= {"chin": self._chin(), "lip_lines": self._lip_lines(), "neck": self._neck()}
+        regions = self._forehead() | {"glabella": self._glabella(), "bunny": self._bunny()}
+        regions |= {"chin": self._chin(), "lip_lines": self._lip_lines(), "neck": self._neck()}
         for side, sign in zip(SIDES, (1.0, -1.0)):
-            made[f"crow_{side}"] = self._crow(side, sign)
-            made[f"nasolabial_{side}"] = self._nasolabial(side, sign)
-            made[f"under_eye_{side}"] = self._under_eye(side)
-            made[f"dimple_{side}"] = self._dimple(side, sign)
-        return made
+            regions[f"crow_{side}"] = self._crow(side, sign)
+            regions[f"nasolabial_{side}"] = self._nasolabial(side, sign)
+            regions[f"under_eye_{side}"] = self._under_eye(side)
+            regions[f"dimple_{side}"] = self._dimple(side, sign)
+        return regions
 
     def flush(self, name: str, lips: FloatArray) -> FloatArray:
         a, p, s = self.anatomy, self.points, self.s

@@ -358,8 +358,8 @@ def _texture(
         texture = np.stack(sums, axis=1) / total[:, None]
         square = ((values - texture[samples.point]) ** 2).sum(axis=1)
         # Points whose colour changes with light or expression count less than those whose colour stays.
-        own = np.bincount(samples.point, robust * square, points) / total
-        scale = tolerance * np.maximum(own, max(float(np.median(square)), 1e-5))[samples.point]
+        mean_square = np.bincount(samples.point, robust * square, points) / total
+        scale = tolerance * np.maximum(mean_square, max(float(np.median(square)), 1e-5))[samples.point]
         robust = weight / (1 + square / scale) ** 2
     return texture.astype(np.float32), (3 * robust / scale).astype(np.float32)
 
@@ -399,10 +399,10 @@ def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, s
     ``landmarks``: (T, 1, L, 2) pixels of ``camera``. ``side``: Longer side of the camera's whole picture in pixels of
     ``camera``, before it was cropped.
     """
-    part = landmarks.of(landmarks.seen)
-    part = part.of(np.unique(np.linspace(0, len(part.pixels) - 1, FRAMES).astype(int)))
+    sample = landmarks.of(landmarks.seen)
+    sample = sample.of(np.unique(np.linspace(0, len(sample.pixels) - 1, FRAMES).astype(int)))
     tried = side * np.array(TRIED)
-    residuals = np.array([_residual(head, camera, part, focal) for focal in tried])
+    residuals = np.array([_residual(head, camera, sample, focal) for focal in tried])
     best = int(residuals.argmin())
     pixels = tried[best]
     if 0 < best < len(tried) - 1:

@@ -195,8 +195,8 @@ class PointRig:
         for joint, parent in enumerate(self._parents):
             above, shift = (np.eye(3), np.zeros(3)) if parent < 0 else (turns[parent], shifts[parent])
             turns[joint] = above @ rotations[joint]
-            own = slice(3 * joint, 3 * joint + 3)
-            turns_by[own, joint] = above @ derivatives[joint].transpose(2, 0, 1)
+            columns = slice(3 * joint, 3 * joint + 3)
+            turns_by[columns, joint] = above @ derivatives[joint].transpose(2, 0, 1)
             bend_by = -turns_by[:, joint]
             by_coefficient[joint] = (above - turns[joint]) @ self._joint_basis[joint]
             if parent >= 0:
@@ -229,8 +229,8 @@ def outliers(poses: FloatArray, residuals: FloatArray, columns: PoseColumns) -> 
     wrong = (residuals[:, 0] <= 0) | (residuals > WORSE * _median(residuals)).any(axis=1)
     # The Frobenius norm of the difference of two rotations is about their angle times the root of 2.
     for values, least in ((turns / np.sqrt(2), TURN), (poses[:, columns.translation], MOVE)):
-        apart = np.linalg.norm(values - _median(values), axis=1)
-        wrong |= apart > max(least, USUAL * float(np.median(apart)))
+        distances = np.linalg.norm(values - _median(values), axis=1)
+        wrong |= distances > max(least, USUAL * float(np.median(distances)))
     return np.asarray(wrong)
 
 

@@ -98,12 +98,12 @@ def mesh_errors(found: FloatArray, wanted: FloatArray, turns: FloatArray) -> Reg
         return 1e3 * float(np.sqrt((gaps**2).sum(axis=-1).mean()))
 
     gaps = found - wanted
-    own = np.einsum("tij,tni->tnj", turns, gaps)
+    local = np.einsum("tij,tni->tnj", turns, gaps)
     mapped = []
     for one, other in zip(found, wanted):
         terms = np.concatenate([one - one.mean(axis=0), np.ones((len(one), 1))], axis=1)
         mapped.append(terms @ np.linalg.lstsq(terms, other, rcond=None)[0] - other)
-    return RegionError(spread(gaps), spread(np.stack(mapped)), spread(own - own.mean(axis=0)))
+    return RegionError(spread(gaps), spread(np.stack(mapped)), spread(local - local.mean(axis=0)))
 
 
 LEAST_TRACKED = 0.5
@@ -214,12 +214,12 @@ def track(
     fits = _Fits(clip, [*cameras], views, store)
     pixels: dict[int, FloatArray] = {}
     for block in range(blocks):
-        landmarks = source(part := timesteps[block::blocks])
-        pixels |= dict(zip(part, landmarks.pixels))
+        landmarks = source(chosen := timesteps[block::blocks])
+        pixels |= dict(zip(chosen, landmarks.pixels))
         if landmarks.seen.any():
-            part = [timestep for timestep, seen in zip(part, landmarks.seen) if seen]
+            chosen = [timestep for timestep, seen in zip(chosen, landmarks.seen) if seen]
             part_progress = partial(_part_progress, progress, block, blocks)
-            fits.fit(f"part-{block:05d}", part, landmarks.of(landmarks.seen), part, part_progress)
+            fits.fit(f"part-{block:05d}", chosen, landmarks.of(landmarks.seen), chosen, part_progress)
     if not fits.poses:
         raise InputError(where, "landmarks", "a face in some image that fits the head model", "none")
     first = fits.outliers()
@@ -231,10 +231,10 @@ def track(
         fits.poses |= {timestep: fits.poses[one] for timestep, one in nearest.items()}
         # Others give the colours of the points.
         others = sorted(good, key=lambda one: min(abs(one - timestep) for timestep in wrong))[:half]
-        part = sorted([*wrong, *others])
-        again = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in part]))
+        refitted = sorted([*wrong, *others])
+        again = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in refitted]))
         part_progress = partial(_part_progress, progress, blocks + number, blocks + len(parts))
-        fits.fit(f"again-{number:05d}", part, again, wrong, part_progress)
+        fits.fit(f"again-{number:05d}", refitted, again, wrong, part_progress)
     last = fits.outliers()
     kept = sorted({*fits.poses} - last)
     report = TrackingReport(

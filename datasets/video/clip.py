@@ -177,10 +177,12 @@ class FrameView(NamedTuple):
 
     def image(self, frame: ByteArray) -> ByteArray:
         """The view of a frame or a mask of its size."""
-        part = self.crop.of(frame)
-        if part.shape[:2] == (self.height, self.width):
-            return part
-        return np.asarray(cv2.resize(part, (self.width, self.height), interpolation=cv2.INTER_AREA), np.uint8)
+        cropped = self.crop.of(frame)
+        if cropped.shape[:2] == (self.height, self.width):
+            return cropped
+        return np.asarray(
+            cv2.resize(cropped, (self.width, self.height), interpolation=cv2.INTER_AREA), np.uint8
+        )
 
     def points(self, pixels: FloatArray) -> FloatArray:
         """(..., 2) pixels of the view from those of a frame."""
@@ -230,12 +232,14 @@ class MaskSource:
         if not self.by_background:
             return
         empty = evenly_with_ends(np.flatnonzero(~faces.found & (faces.others == 0)).tolist(), SAMPLES)
-        shown = evenly_with_ends(np.flatnonzero(faces.found).tolist(), CHECKED)
-        chosen = {*faces.numbers[[*empty, *shown]].tolist()}
+        checked = evenly_with_ends(np.flatnonzero(faces.found).tolist(), CHECKED)
+        chosen = {*faces.numbers[[*empty, *checked]].tolist()}
         images = {frame.number: view.image(frame.image) for frame in frames if frame.number in chosen}
         self._background = learn_background(path, [images[number] for number in faces.numbers[empty]])
-        pixels = view.points(faces.pixels[shown])
-        check_background(path, self._background, [images[number] for number in faces.numbers[shown]], pixels)
+        pixels = view.points(faces.pixels[checked])
+        check_background(
+            path, self._background, [images[number] for number in faces.numbers[checked]], pixels
+        )
 
     def mask(self, frame: TimedFrame, view: FrameView, face: FloatArray) -> ByteArray:
         """(H, W) 8-bit coverage of the person in the view of a frame with landmarks ``face``, (L, 2) pixels of the frame."""
@@ -307,8 +311,8 @@ def open_video(
     masks = MaskSource(options)
     mark = digest(TRACKER_VERSION, digest_file(path), finder.digest, options.rate, options.longest)
     faces = find_faces(path, _frames(path, options), finder, out / FACES, mark, progress)
-    shown = faces.numbers[faces.found].tolist()
-    mark = digest(mark, options.size, masks.prepare(shown, info))
+    numbers = faces.numbers[faces.found].tolist()
+    mark = digest(mark, options.size, masks.prepare(numbers, info))
     folder = out / f"{IMAGES}-{mark[:16]}"
     for other in out.glob(f"{IMAGES}-*"):
         if other != folder:
@@ -320,7 +324,7 @@ def open_video(
     K = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
     camera = Camera("0", view.width, view.height, K, np.eye(4))
     frames = []
-    for number in shown:
+    for number in numbers:
         mask = folder / MASKS / f"{number:05d}.png" if masks else None
         image, where = folder / f"{number:05d}.png", (path, f"frame {number}")
         frames.append(VideoFrame(where, VIDEO, number, image, mask, camera, _neutral(head)))
@@ -333,7 +337,7 @@ def open_video(
         use_cache=False,
         progress=progress,
     )
-    unsure = tuple(masks.unsure[number] for number in shown if masks.unsure)
+    unsure = tuple(masks.unsure[number] for number in numbers if masks.unsure)
     return VideoClip(clip, info, view, faces, view.points(faces.pixels[faces.found]), unsure)
 
 

@@ -165,5 +165,5 @@ def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
 
 def listed(numbers: Sequence[int]) -> str:
     """How many frames, and which."""
-    shown = ", ".join(map(str, numbers[:8])) + (" ..." if len(numbers) > 8 else "")
-    return f"{counted(len(numbers), 'frame')} ({shown})"
+    text = ", ".join(map(str, numbers[:8])) + (" ..." if len(numbers) > 8 else "")
+    return f"{counted(len(numbers), 'frame')} ({text})"

@@ -62,8 +62,8 @@ class FaceDetector:
             small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
             for left, top in product(*map(_starts, size)):
                 square = np.zeros((SIDE, SIDE, 3), np.uint8)
-                part = small[max(0, top) : top + SIDE, max(0, left) : left + SIDE]
-                square[max(0, -top) :, max(0, -left) :][: len(part), : part.shape[1]] = part
+                tile = small[max(0, top) : top + SIDE, max(0, left) : left + SIDE]
+                square[max(0, -top) :, max(0, -left) :][: len(tile), : tile.shape[1]] = tile
                 scores, points = self._run(square)
                 detections += [
                     np.concatenate([[score], (one + [left, top]).ravel() / scale])

@@ -222,8 +222,8 @@ def initial_seeds(vertices: FloatArray, density: FloatArray, count: int) -> IntA
     code = np.zeros(len(vertices), np.uint64)
     for bit in range(9):
         for axis in range(3):
-            part = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
-            code |= part << np.uint64(3 * bit + axis)
+            bits = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
+            code |= bits << np.uint64(3 * bit + axis)
     order = np.argsort(code, kind="stable")
     share = np.cumsum(density[order])
     return order[np.unique(np.searchsorted(share, (np.arange(count) + 0.5) * share[-1] / count))]

@@ -124,8 +124,8 @@ def _first_alignment(source: HeadAsset, neutral: FloatArray, target: HeadAsset) 
         expected = f"at least three of the regions {', '.join(_LANDMARK_REGIONS)} in both models"
         raise InputError(f"head model {source.version!r}", "regions", expected, ", ".join(names) or "none")
     here = np.array([neutral[source.regions[name]].mean(axis=0) for name in names])
-    there = np.array([target.template[target.regions[name]].mean(axis=0) for name in names])
-    return rigid_alignment(here, there)
+    centres = np.array([target.template[target.regions[name]].mean(axis=0) for name in names])
+    return rigid_alignment(here, centres)
 
 
 def _counterparts(

@@ -123,8 +123,8 @@ class FitProblem:
         count, size = len(wanted), self._plain.shape[2]
         products = [(weighted.reshape(count, -1) @ self._plain.reshape(-1, size))[:, None]]
         for rows, turned in self._turned:
-            part = weighted[:, rows].transpose(0, 2, 1).reshape(3 * count, -1)
-            block = part @ turned.reshape(len(rows), -1)  # row: target's component; columns: (c, N)
+            rows_of_head = weighted[:, rows].transpose(0, 2, 1).reshape(3 * count, -1)
+            block = rows_of_head @ turned.reshape(len(rows), -1)  # row: target's component; columns: (c, N)
             products.append(block.reshape(count, 9, size))
         stacked = np.concatenate(products, axis=1)
         squares = np.einsum("tni,tni->t", weighted, wanted)
@@ -161,8 +161,8 @@ class FitProblem:
         spread = side_by_side @ (by_double + by_double.T)
         by_matrix = {joint: np.zeros((3, 3)) for joint in range(len(JOINT_NAMES))}
         for index, joint in enumerate(self._turning):
-            own = by_entry[9 * index : 9 * index + 9].reshape(3, 3)
-            by_matrix[joint] = own + spread[:, 3 * index : 3 * index + 3]
+            derivative = by_entry[9 * index : 9 * index + 9].reshape(3, 3)
+            by_matrix[joint] = derivative + spread[:, 3 * index : 3 * index + 3]
         corner = np.tril(gram[split:, split:]) + np.tril(gram[split:, split:], -1).T
         by_fixed = 2 * (gram[split:, :split] @ free + corner @ fixed - product[split:])
         for (joint, entry), slope in zip(self._correctives, by_fixed):

@@ -152,10 +152,14 @@ def render_participant(settings: SubmissionRenderSettings, progress: Progress = 
         found = f"{method.spec.name}, which works at another"
         raise InputError(folder / AVATAR_FILE, "resolution", expected, found, "Train it with another preset.")
     for name, sequence in sequences.items():
-        shown = stored.shows_another(settings.participant, sequence.shape, head.version)
-        if shown:
+        mismatch = stored.shows_another(settings.participant, sequence.shape, head.version)
+        if mismatch:
             log.warning(
-                "%s shows %s, with another shape than %s has in %s", folder, shown, settings.participant, name
+                "%s shows %s, with another shape than %s has in %s",
+                folder,
+                mismatch,
+                settings.participant,
+                name,
             )
     avatar = stored.load(settings.device)
     home = Path(settings.out) / settings.participant

@@ -217,11 +217,11 @@ def _check_lengths(where: Path, track: BenchmarkTrack, counts: dict[Video, int])
                 where, f"{participant}, {sequence}", expected, ", ".join(map(str, sorted(lengths)))
             )
     for participant, total in (track.totals or {}).items():
-        own = sum(max(lengths) for (name, _), lengths in by_sequence.items() if name == participant)
-        if own != total:
+        frames = sum(max(lengths) for (name, _), lengths in by_sequence.items() if name == participant)
+        if frames != total:
             expected = f"{total} frames in all sequences together, as published"
             remedy = "Render every frame of every test sequence."
-            raise InputError(where, participant, expected, f"{own}", remedy)
+            raise InputError(where, participant, expected, f"{frames}", remedy)
 
 
 # Writing

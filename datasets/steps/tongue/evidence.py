@@ -99,12 +99,12 @@ def _camera_strength(
     colours: ByteArray, seen: np.ndarray, atlas: MouthAtlas
 ) -> tuple[FloatArray, np.ndarray]:
     """(T, H, W) standard deviations by which each pixel looks covered to one camera, and whether it is visible."""
-    known = seen & (seen.mean(axis=0) > _LEAST_SEEN)
-    rows = known.any(axis=(1, 2))
-    strength = np.zeros(known.shape, np.float32)
+    measured = seen & (seen.mean(axis=0) > _LEAST_SEEN)
+    rows = measured.any(axis=(1, 2))
+    strength = np.zeros(measured.shape, np.float32)
     if rows.any():
-        strength[rows] = _strength(_features(colours[rows], seen[rows]), known[rows])
-    return strength, known
+        strength[rows] = _strength(_features(colours[rows], seen[rows]), measured[rows])
+    return strength, measured
 
 
 def _strength(values: dict[str, FloatArray], known: np.ndarray) -> FloatArray:
@@ -224,23 +224,23 @@ def write_sheet(
     # Among equal scores, mostly zeros, prefer those next to an excluded frame, where the tongue appears and disappears.
     away = [min((abs(t - other) for other in reasons), default=0) for t in timesteps]
     order = sorted(range(len(timesteps)), key=lambda row: (-float(evidence.areas[row]), away[row]))
-    shown = order[:count] + [row for row in order[count:] if timesteps[row] in decided.overrides]
-    place = {timesteps[row]: number for number, row in enumerate(shown)}
+    displayed = order[:count] + [row for row in order[count:] if timesteps[row] in decided.overrides]
+    place = {timesteps[row]: number for number, row in enumerate(displayed)}
     frames = frames_by_timestep(clip)
-    columns = min(COLUMNS, max(len(shown), 4))
-    rows = -(-len(shown) // columns)
+    columns = min(COLUMNS, max(len(displayed), 4))
+    rows = -(-len(displayed) // columns)
     with new_figure(1.9 * columns, 0.8 + 2.4 * rows) as figure:
         figure.suptitle(
             f"{clip.subject}: {len(reasons)} of {len(timesteps)} timesteps left out (red), threshold "
             f"{decided.threshold:g} mm2 of lip and chin covered\n"
-            f"The {len(shown)} highest scores, outlined what looks covered; "
+            f"The {len(displayed)} highest scores, outlined what looks covered; "
             "an orange bar marks scores near the threshold."
         )
         grid = figure.subplots(rows, columns, squeeze=False).ravel()
-        for axes in grid[len(shown) :]:
+        for axes in grid[len(displayed) :]:
             axes.axis("off")
         for timestep, vertices in posed_meshes(clip, sorted(place)):
-            axes, row = grid[place[timestep]], shown[place[timestep]]
+            axes, row = grid[place[timestep]], displayed[place[timestep]]
             name = next(name for name in decided.cameras if name in frames[timestep])
             image, camera = clip.image(frames[timestep][name]), clip.cameras[name]
             show(axes, mouth_picture(image, camera, atlas, vertices, evidence.patches[row]), frame=True)

@@ -155,10 +155,10 @@ def _lip_line(lips: np.ndarray, lower: np.ndarray, camera: Camera) -> FloatArray
         bottom = rows[lips[:, column] & lower[:, column]]
         if len(top) and len(bottom):
             line[column] = 0.5 * (top.max() + bottom.min())
-    known = np.flatnonzero(np.isfinite(line))
-    if not len(known):
+    finite = np.flatnonzero(np.isfinite(line))
+    if not len(finite):
         return np.full(camera.width, camera.K[1, 2])
-    return np.interp(np.arange(camera.width), known, line[known])
+    return np.interp(np.arange(camera.width), finite, line[finite])
 
 
 FACING = np.cos(np.radians(62.0))
@@ -239,9 +239,9 @@ def sample_clip(
     subject = PosedSubject.of(clip, torch.float32)
     with ThreadPoolExecutor(min(processor_count(), 8)) as pool:
         for start in range(0, len(timesteps), _MESHES):  # a pool would take all jobs and their meshes at once
-            part = timesteps[start : start + _MESHES]
-            meshes = subject.meshes([clip.poses[t] for t in part]).astype(np.float64)
-            rows = range(start, start + len(part))
+            block = timesteps[start : start + _MESHES]
+            meshes = subject.meshes([clip.poses[t] for t in block]).astype(np.float64)
+            rows = range(start, start + len(block))
             for row, _ in zip(rows, pool.map(sample, rows, meshes)):
                 progress(row + 1, len(timesteps), "mouths")
     return MouthColours(timesteps, list(cameras), colours, seen)
