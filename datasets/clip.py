@@ -1,4 +1,17 @@
-"""A `Clip` over files on disk."""
+"""A `Clip` over files on disk.
+
+Masks of the parts of the tracked head in a frame: from the posed mesh by a z-buffer, and from the mask.
+
+* ``foreground``: pixels that the mask covers by half or more.
+* ``face``: the mesh's face, lips, eyes and the opening of the mouth, where the mesh does not hide them.
+* ``mouth``: the convex hull of the visible lips, so that teeth, tongue and the dark between them belong to it.
+* ``eyes``: eyeballs and the skin about them.
+* ``neck`` and ``ears``: those of the mesh, where it does not hide them.
+* ``hair``: the mesh's scalp, and foreground beyond the mesh whose nearest pixel of the mesh is scalp: hair extends
+  beyond the head. Hair beside the neck is included.
+
+Mouth and hair are limited to the foreground, if there is a mask. Regions are as accurate as the tracking.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Reading and writing of images and masks, with a memory-bounded LRU cache of decoded ones."""
+"""Reading and writing of images and masks, with a memory-bounded LRU cache of decoded ones.
+
+The sRGB curve.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Opens captures of any layout; the reader is found in the registry by name or by the folder's content."""
+"""Opens captures of any layout; the reader is found in the registry by name or by the folder's content.
+
+Recognise other formats than captures and suggest a conversion, for error messages.
+"""
 
 from __future__ import annotations
 
@@ -203,7 +206,7 @@ def _quoted(path: Path) -> str:
 
 
 def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
-    """The reader ``name``, see `registry.get`; without a name, the one that finds captures under ``path``."""
+    """The reader ``name``, see `registry.get`; without a name ga, unless only another one finds captures under ``path``."""
     if name:
         spec: DatasetSpec = get("datasets", name)
         return spec
@@ -212,7 +215,8 @@ def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
     expected = f"a capture that a reader knows ({', '.join(specs)})"
     if not root.exists():
         raise InputError(root, "", expected, "no such file or folder")
-    fitting = [spec for spec in specs.values() if finds(spec, root)]
+    ga = specs.get("ga")
+    fitting = [ga] if ga and finds(ga, root) else [spec for spec in specs.values() if finds(spec, root)]
     if not fitting:
         raise InputError(root, "", expected, *describe(root))
     if len(fitting) > 1:

@@ -3,6 +3,10 @@
 pycolmap's own reader (4.2) does not check files: of 220 truncations of an ``images.bin``, 72 gave wrong values without an
 error and 9 did not terminate. It also needs a file of points, which many projects lack, and ends names at a space.
 
+Removal of lens distortion from images, so that a pinhole camera describes them. Lenses are named and parametrised as
+COLMAP does (its ``sensor/models.h``), which shares OpenCV's formulas. Pixel coordinates have the centre of the top left
+pixel at (0.5, 0.5), in COLMAP as here.
+
 Formats read:
 
 - COLMAP models, binary. Written by colmap/colmap (`src/colmap/scene/reconstruction_io_binary.cc`). Checked on

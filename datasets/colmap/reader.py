@@ -14,6 +14,9 @@ each timestep, and their head model. `export colmap --tracking` writes such a da
 As here, the centre of the top left pixel is at (0.5, 0.5), and the world is mapped to the camera with OpenCV's axes.
 Position, orientation and scale of the world are those of the reconstruction, in metres only if it was made from metric
 poses; tracking must be in the same world.
+
+Write a clip as a COLMAP dataset: images, masks, and a sparse model with the tracked mesh as its points. Layout of
+``colmap`` and of radiance-field codes that read it: ``images/``, ``masks/``, ``sparse/0/``.
 """
 
 from __future__ import annotations

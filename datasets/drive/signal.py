@@ -1,4 +1,25 @@
-"""A driving signal as poses of a head model."""
+"""A driving signal as poses of a head model.
+
+The 52 blendshapes of ARKit and MediaPipe, and their effect on a head model with jaw and eye joints. FLAME has no such
+shapes. They are applied to a head that has them, the embedded one or one with ARKit's expression names such as
+ICT-FaceKit's, and its vertices are transferred to the avatar's head.
+
+Formats read:
+
+- Live Link Face CSV. Written by Epic Games' Live Link Face for iPhone, and like it by AnimaVR/NeuroSync_Player
+  (`utils/csv/save_csv.py`). Checked on alexdjulin/LiveLinkFace-CSV-Retarget-For-Motionbuilder@6492a4a1 `anim/alex_rom_3.csv`
+  and AnimaVR/NeuroSync_Player@f31b8fad `livelink/animations/Sad/MySlate_167_iPhone_cal.csv`.
+- MediaPipe Face Landmarker results, JavaScript. Written by google-ai-edge/mediapipe
+  (`mediapipe/tasks/web/vision/face_landmarker`). Not checked on a file of the program.
+- MediaPipe Face Landmarker results, Python and Unity. Written by google-ai-edge/mediapipe
+  (`mediapipe/tasks/python/vision/face_landmarker.py`) and homuler/MediaPipeUnityPlugin. Not checked on a file of the program.
+- Audio2Face-3D CSV. Written by NVIDIA/Audio2Face-3D-Samples
+  (`scripts/audio2face_3d_api_client/a2f_3d/client/service.py`). Checked on walkoncross/NIM-audio2face-visualization@e563d13b
+  `viz-threejs/assets/animation_frames.csv`.
+- Audio2Face JSON. Written by NVIDIA Omniverse Audio2Face. Not checked on a file of the program.
+- LAM JSON. Written by aigc3d/LAM_Audio2Expression (`models/utils.py`). Checked on aigc3d/LAM_WebRender@12174e94
+  `asset/test_expression_1s.json`.
+"""
 
 from __future__ import annotations
 

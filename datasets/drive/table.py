@@ -1,6 +1,8 @@
 """Tables of values over time: CSV, JSON, JSON lines, npz, and folders with one file per frame.
 
 A table has a row for each frame of the file. Rows without a face have empty values, and `SignalTable.with_face` leaves them out.
+
+Names of the arrays of FLAME coefficients in the outputs of trackers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Transfer of a signal to the head model of an avatar, relative to the signal's neutral face, and smoothing over time."""
+"""Transfer of a signal to the head model of an avatar, relative to the signal's neutral face, and smoothing over time.
+
+Signals whose frames arrive one by one, as lines of JSON.
+"""
 
 from __future__ import annotations
 

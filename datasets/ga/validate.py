@@ -1,6 +1,11 @@
 """Checks of a whole capture before any long work: images, timesteps, leaks between splits.
 
 Each fault is an `InputError` with file, entry, expected and found value.
+
+Digests of file contents, stored in the user's cache and valid while the files are unchanged. JSON, npz and text are
+digested in a form that does not depend on the program that wrote the same content: white space, order of keys and
+arrays, compression, 1 for 1.0, and the spelling of paths and camera ids. For files of headbench it is the file's own
+bytes. Other files, such as images, are digested as they are.
 """
 
 from __future__ import annotations

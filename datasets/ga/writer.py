@@ -2,6 +2,8 @@
 
 Images are written first, in any order and over several runs; `CaptureWriter.write_metadata` then checks that all exist
 and writes parameters and JSONs, those of the union last, so a folder with a union JSON is a complete capture.
+
+Write a clip with other tracking as a new capture; PNG files that no step changes are linked.
 """
 
 from __future__ import annotations

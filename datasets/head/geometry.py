@@ -1,4 +1,10 @@
-"""Geometry of points and triangle meshes in numpy."""
+"""Geometry of points and triangle meshes in numpy.
+
+Rounding to a grid of powers of two, so that all x86-64 machines give the same values. The last digits of exp, sin,
+decompositions and long sums depend on instruction set, BLAS and threads. Values of a synthetic capture are rounded when
+computed, at least a thousand times coarser than those digits; products and sums of such numbers within the 53 bits of a
+float64 are then exact in any order.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,13 @@
 
 Li et al., "Learning a model of facial shape and expression from 4D scans", SIGGRAPH Asia 2017, section 4;
 the formulation of the skinning is that of SMPL (Loper et al., SIGGRAPH Asia 2015, section 3).
+
+A head with one identity: its neutral mesh, and its meshes and rigid motions over poses. A tracker of single videos
+keeps the head still and lets the camera move around it. With M the rigid motion of the head (global rotation about the
+root joint, neck rotation about the neck joint, translation) a camera W in the world becomes W M in the head's frame,
+and the pose keeps only expression, jaw, eyes and eyelids. Projections of vertices that follow the neck joint are
+unchanged except for the neck's pose correctives; vertices that follow the root (lower neck, shoulders) move with the
+head, as in such methods.
 """
 
 from __future__ import annotations

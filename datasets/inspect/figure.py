@@ -1,4 +1,8 @@
-"""The figure of a capture: camera rig, splits, tracked mesh on images, motion."""
+"""The figure of a capture: camera rig, splits, tracked mesh on images, motion.
+
+Overlays of the tracked mesh on images, for visual inspection of the tracking. Heat map of a refit: the subject's
+neutral head, coloured by mean residual.
+"""
 
 from __future__ import annotations
 

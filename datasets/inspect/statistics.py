@@ -1,4 +1,7 @@
-"""Statistics of a capture: content of the splits and motion of the face in each sequence."""
+"""Statistics of a capture: content of the splits and motion of the face in each sequence.
+
+Novelty of test expressions relative to those of training.
+"""
 
 from __future__ import annotations
 

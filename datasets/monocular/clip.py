@@ -1,4 +1,9 @@
-"""Clips of tracked videos: one camera, splits by the held-out frames, masks composited."""
+"""Clips of tracked videos: one camera, splits by the held-out frames, masks composited.
+
+Common representation of tracked videos: frames with a camera and a pose each. In these layouts the head is static, or
+nearly so, and every frame has its own camera. A clip has one camera and a moving head: `fix_camera` converts the former
+to the latter.
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,8 @@
 Sources: "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations"
 (CVPR 2025), section 4 and supplement, for the subjects and the split by FREE; VHAP's union export for the ten
 sequences and the rule that holds one of them out.
+
+Settings of the conversion of NeRSemble recordings.
 """
 
 from __future__ import annotations

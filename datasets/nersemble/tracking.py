@@ -1,5 +1,8 @@
 """Tracked FLAME parameters of VHAP, found by subject and sequence, and validated.
 
+Check of unions exported elsewhere, and joining for the paper's split. GaussianAvatars' download holds, per subject, a
+``UNION10`` folder and its sequence folders, FREE among them; the union uses another test sequence.
+
 Formats read:
 
 - VHAP's `tracked_flame_params_*.npz`. Written by ShenhanQian/VHAP@4b64ab7d (`vhap/model/tracker.py`). Not checked on a file of the program.

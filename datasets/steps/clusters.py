@@ -9,6 +9,12 @@ Both embeddings, of all pairs and of a few columns of the similarity matrix (Nys
 `SpectralClustering` with a precomputed affinity: leading eigenvectors of D^-1/2 (S - I) D^-1/2, each row divided by
 the square root of its degree. Von Luxburg, "A tutorial on spectral clustering", Statistics and Computing 2007;
 Fowlkes, Belongie, Chung and Malik, "Spectral grouping using the Nyström method", PAMI 2004.
+
+Jaw bases: a few jaw rotations that span those of a performance, and the weights of a pose on them. "3D Gaussian Head
+Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations" (CVPR 2025, arXiv 2504.14967), section
+on feature lines. The paper's code selects the bases from validation and test poses and seeds them with a half turn;
+here they are selected only from training poses and seeded with the identity. The published behaviour is
+``variant="official"``.
 """
 
 from __future__ import annotations

@@ -1,6 +1,10 @@
 """Conversion of a clip to the requirements of a method, and of its renders back.
 
 Found by the harness as the entry point of `headbench.adaptation`, see `headbench.bench.engine.adaptation`.
+
+Resolution alignment: resizes a clip to a method's image size, and renders back to the protocol's size. Image
+coordinates are measured from the top left corner of the top left pixel, so that coordinates scale without an offset: x'
+= x * width' / width. Colours are resampled as stored (display-referred), as in other tools.
 """
 
 from __future__ import annotations

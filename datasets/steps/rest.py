@@ -1,4 +1,8 @@
-"""A rest expression other than zero, as of trackers whose coefficients at rest depend on the person."""
+"""A rest expression other than zero, as of trackers whose coefficients at rest depend on the person.
+
+A chart for head models without texture coordinates, for methods that place splats on a chart. Rotation of the neck
+moved into the rigid motion of the head, as trackers without a neck joint describe a head.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 Everything is measured on the subject's own neutral shape, so that any head with the named landmarks (or the
 68 of iBUG's scheme) can be rendered. Left is the subject's left, +x; +y is up and +z is front; metres.
+
+Distances to points, polylines and polygons, and noise, from which skin, hair and wrinkles are painted.
 """
 
 from __future__ import annotations

@@ -2,6 +2,10 @@
 
 The cap is the scalp itself pushed outwards, so that no skin shows between the locks and the mask stays
 whole; the locks give strands, shine and a soft outline. Both move with the head.
+
+Static offset of hair, beard and sagging skin, like that of a tracker with vertex offsets such as VHAP. VHAP fits one
+offset a vertex to all frames under a Laplacian penalty: the hair's volume without its locks. Here it is a part of the
+mean thickness of hair over the head model's own vertices, smoothed over its edges.
 """
 
 from __future__ import annotations

@@ -2,6 +2,11 @@
 
 A state is a function of the exact controls of a sequence up to a timestep, starting at rest. Tracked parameters alone
 do not determine it.
+
+Hair and the skin of the neck follow the head late, which tracked parameters do not show. Each follows as a mass on a
+damped spring, with a transfer function of second order. Hair swings as a rod that hangs from one end (compare Keller,
+"Ponytail motion", SIAM Journal on Applied Mathematics 70(7), 2010), so that its frequency follows from its length.
+Damping, and both numbers of the neck, are choices, not measurements.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""Eyeballs and parts of the mouth to render. Eyeballs are finer than the tracked ones, with painted cornea, iris and veins."""
+"""Eyeballs and parts of the mouth to render. Eyeballs are finer than the tracked ones, with painted cornea, iris and veins.
+
+Visible but untracked parts of the mouth: teeth, gums and tongue of the default head. They are rendered in synthetic
+captures and are not in the head model: as in a real capture, methods must learn them from the images. The wall of the
+mouth is part of the skin (region ``mouth_socket``).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Renders a subject's frames with `panels` and converts them to 8-bit images and masks."""
+"""Renders a subject's frames with `panels` and converts them to 8-bit images and masks.
+
+Ground truth of a synthetic capture for poses and views without recorded images.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Timesteps in files of trackers, ``checkpoint/00012.frame``: files of ``torch.save`` with dictionaries of arrays."""
+"""Timesteps in files of trackers, ``checkpoint/00012.frame``: files of ``torch.save`` with dictionaries of arrays.
+
+Images and masks of tracked frames, found by the numbers in their names. A tracked video of a tracker's frames, their
+images and a head model.
+"""
 
 from __future__ import annotations
 

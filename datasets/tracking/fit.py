@@ -1,4 +1,8 @@
-"""Fit a head model to images: landmarks first, then colours of surface points."""
+"""Fit a head model to images: landmarks first, then colours of surface points.
+
+Gauss-Newton steps for the poses of all timesteps and one shape: normal equations with an arrowhead matrix. The focal
+length of one camera from landmarks of a head model.
+"""
 
 from __future__ import annotations
 

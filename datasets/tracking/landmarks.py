@@ -1,4 +1,8 @@
-"""Landmarks in images: sources, and corresponding points of the mesh."""
+"""Landmarks in images: sources, and corresponding points of the mesh.
+
+Embedding of a network's landmarks on a head model. Landmarks by MediaPipe's face landmark network, and their places on
+a head, found in drawings of it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Trackers of other authors, run in the user's own installation on the file of a video."""
+"""Trackers of other authors, run in the user's own installation on the file of a video.
+
+Requirements of the trackers of other authors on the machine, for ``headbench doctor``. ``headbench track --with``: runs
+another tracker in the user's installation and converts its result to a capture.
+"""
 
 from __future__ import annotations
 

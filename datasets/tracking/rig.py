@@ -3,6 +3,8 @@
 A point is a fixed mixture of up to three vertices. Bases and skinning weights are mixed once, so that a few thousand points
 are evaluated instead of the whole mesh. At vertices this is exact; inside a triangle it differs from mixing the posed vertices
 by a part of the change of the skinning weights across the triangle.
+
+Timesteps whose fit differs from that of their neighbours.
 """
 
 from __future__ import annotations

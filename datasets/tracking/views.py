@@ -1,4 +1,7 @@
-"""Cameras as arrays: projection with derivatives, and visibility by a coarse depth buffer."""
+"""Cameras as arrays: projection with derivatives, and visibility by a coarse depth buffer.
+
+Blurred images of all frames, sampled with their gradients.
+"""
 
 from __future__ import annotations
 

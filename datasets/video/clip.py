@@ -1,5 +1,7 @@
 """A video file as a clip that is not tracked yet: frames with a face, cropped and masked, and one camera.
 
+Masks of a person by background subtraction of the empty room, for a static camera.
+
 Formats read:
 
 - Masks of the frames of a video. Written by PeterL1n/RobustVideoMatting (`inference_utils.py`). Not checked on a file of

@@ -1,4 +1,12 @@
-"""Localisation of one person's head in the frames of a video."""
+"""Localisation of one person's head in the frames of a video.
+
+Boxes of faces by MediaPipe's face detector, whose file is read without the package mediapipe.
+
+Formats read:
+
+- MediaPipe's face detector. Written by google-ai-edge/mediapipe 0.10.21. Checked on its wheel,
+  `mediapipe/modules/face_detection/face_detection_full_range_sparse.tflite`.
+"""
 
 from __future__ import annotations
 

@@ -52,17 +52,22 @@ def fails(root):
 def test_readers_of_plug_ins_beside_the_one_that_fits(pristine_capture, monkeypatch, caplog):
     known = registry.discover("datasets")
 
-    def offer(**changes):
-        twin = replace(known["ga"], name="other", spec=replace(known["ga"].spec, name="other", **changes))
-        monkeypatch.setattr(registry, "discover", lambda group: {**known, "other": twin})
+    def offer(**finds):
+        """Copies of the reader ga by name, each with its function that finds captures; None is ga's own."""
+        ga = known["ga"]
+        twins = {
+            name: replace(ga, name=name, spec=replace(ga.spec, name=name, find=find or ga.spec.find))
+            for name, find in finds.items()
+        }
+        monkeypatch.setattr(registry, "discover", lambda group: {**known, **twins})
 
-    offer()
-    with pytest.raises(InputError, match=r"one for ga, other. Choose with --reader"):
-        open_clip(pristine_capture.union)
-    assert open_clip(pristine_capture.union, "ga").poses
-    offer(find=f"{__name__}:fails")
+    offer(other=None)
     assert find_reader(pristine_capture.union).name == "ga"
-    assert "reader other cannot check" in caplog.text
+    offer(ga=f"{__name__}:fails", one=None, two=None)
+    with pytest.raises(InputError, match=r"one for one, two. Choose with --reader"):
+        open_clip(pristine_capture.union)
+    assert open_clip(pristine_capture.union, "one").poses
+    assert "reader ga cannot check" in caplog.text
 
 
 def test_a_clip_of_another_reader_passes_through_steps(plain_folder, pristine_capture):

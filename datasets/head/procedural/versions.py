@@ -1,4 +1,7 @@
-"""Versions of the default head, and the coefficients of its named shapes in each."""
+"""Versions of the default head, and the coefficients of its named shapes in each.
+
+Names of the expressions of head models.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,13 @@
-"""Submissions to the NeRSemble benchmark: writing a zip of videos from frames, and checking it like the server does."""
+"""Submissions to the NeRSemble benchmark: writing a zip of videos from frames, and checking it like the server does.
+
+Videos that the NeRSemble benchmark requests: participants, sequences, size, rate and length. Source: the documentation
+and constants of nersemble-benchmark (commit e15f204, 2026-04).
+
+Formats read:
+
+- FLAME tracking of the NeRSemble benchmark. Written by the authors of tobias-kirschstein/nersemble-benchmark@e15f204d,
+  whose `src/nersemble_benchmark/data/benchmark_data.py` it follows. Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 

@@ -7,6 +7,8 @@ blush, pallor, wrinkles, shadows and an open mouth do not change that ratio of s
 
 Every comparison is with the subject's canonical map (the median over timesteps), camera by camera, and tolerates
 tracking errors: a pixel counts only if no pixel within `FORGIVEN` of its position looks similar.
+
+A contact sheet for review: mouths by score, with outlines of covered areas and the decision as a frame.
 """
 
 from __future__ import annotations
