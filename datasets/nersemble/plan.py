@@ -24,8 +24,7 @@ from .names import (
     PrepareSettings,
     union10_held_out,
 )
-from .pixels import Correction
-from .recording import Participant, participant, read_calibration
+from .recording import Correction, Participant, participant, read_calibration
 from .sequence import RecordedSequence, read_sequence
 from .tracking import TrackedSequence, find_tracked, read_tracked
 

@@ -33,8 +33,8 @@ from ..ga.writer import camera_record, file_record, save_npz, transforms_documen
 from ..head.arrays import save_head
 from ..images import is_whole, read_mask, write_image
 from .names import NOVEL_VIEW_CAMERA
-from .pixels import prepare_pixels, read_still
 from .plan import CY, PreparationPlan, SequenceJob
+from .recording import prepare_pixels, read_still
 from .sequence import RecordedView, open_video
 from .tracking import TrackedSequence
 

@@ -17,8 +17,7 @@ from scipy.sparse import csr_array
 from ...bench.contracts import Camera, FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError
 from .landmarks import ImageLandmarks, spread_vertices
-from .rig import PointRig, PoseColumns, PosedPoints
-from .views import FrameStack, Occlusion, Views
+from .rig import FrameStack, Occlusion, PointRig, PoseColumns, PosedPoints, Views
 
 
 class HeadState(NamedTuple):

@@ -34,7 +34,7 @@ from ..head.geometry import vertex_normals
 from ..head.model import PosedSubject
 from ..head.refit.identity import closest_points
 from ..mesh_pictures import draw_mesh, rasterize_mesh
-from .views import Occlusion, Views
+from .rig import Occlusion, Views
 
 LEARNING_FRAMES = 120
 """Images of a capture from which an embedding is learnt."""

@@ -29,9 +29,8 @@ from ..head.model import PosedSubject
 from ..open import open_clip
 from .fit import Fitter, HeadState
 from .landmarks import ImageLandmarks, landmark_source
-from .rig import PoseColumns, outliers
+from .rig import FrameStack, PoseColumns, Views, outliers
 from .settings import TRACKER_VERSION
-from .views import FrameStack, Views
 
 LID_REACH = 1.25
 """Lids are the skin within this many radii of an eyeball's centre."""

@@ -21,7 +21,7 @@ import torch
 from ...bench.contracts import Clip, FloatArray, FrameKey, HeadPose, IntArray
 from ...bench.protocol import evenly_with_ends
 from ...datasets.head.geometry import rigid_alignment
-from ...datasets.tracking.views import FrameStack, Occlusion, Views
+from ...datasets.tracking.rig import FrameStack, Occlusion, Views
 from .subject_mesh import SubjectMesh
 
 TIMESTEPS, CAMERAS, POINTS = 64, 8, 1500

@@ -66,7 +66,7 @@ def test_readers_of_plug_ins_beside_the_one_that_fits(pristine_capture, monkeypa
     offer(ga=f"{__name__}:fails", one=None, two=None)
     with pytest.raises(InputError, match=r"one for one, two. Choose with --reader"):
         open_clip(pristine_capture.union)
-    assert open_clip(pristine_capture.union, "one").poses
+    assert open_clip(pristine_capture.union, "ga").poses
     assert "reader ga cannot check" in caplog.text
 
 

@@ -23,8 +23,8 @@ from scipy import ndimage
 
 from ....bench.contracts import ByteArray, Camera, Clip, FloatArray
 from ....bench.io.figures import pixels
-from ...figures import new_figure, shortened, show
 from ...images import srgb_to_linear, write_image
+from ...inspect.figure import new_figure, shortened, show
 from ..exclude import Exclusions, FrameDecision
 from .mouth import PITCH, MouthAtlas, MouthColours, frames_by_timestep, posed_meshes
 

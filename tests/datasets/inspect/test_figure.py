@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.figures import pixels
-from headbench.datasets.figures import HELD_OUT, TRAIN, hexadecimal, new_figure
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.inspect.command import (
@@ -24,8 +23,12 @@ from headbench.datasets.inspect.command import (
     steps,
 )
 from headbench.datasets.inspect.figure import (
+    HELD_OUT,
+    TRAIN,
     draw_rig,
     head_frame,
+    hexadecimal,
+    new_figure,
     overlay,
     pick_cameras,
     pick_timesteps,

@@ -16,7 +16,7 @@ from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.tracking import track as track_module
 from headbench.datasets.tracking.fit import Fitter
 from headbench.datasets.tracking.landmarks import known_rig_landmarks, spread_vertices
-from headbench.datasets.tracking.rig import PoseColumns, outliers
+from headbench.datasets.tracking.rig import FrameStack, PoseColumns, Views, outliers
 from headbench.datasets.tracking.track import (
     FOLDER,
     error_regions,
@@ -25,7 +25,6 @@ from headbench.datasets.tracking.track import (
     tracking_errors,
     with_tracking,
 )
-from headbench.datasets.tracking.views import FrameStack, Views
 
 from ..head.toy import toy_head
 
