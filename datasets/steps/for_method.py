@@ -280,7 +280,7 @@ def as_single_video(clip: CaptureClip) -> SingleVideo:
 
     This is how the paper gave multi-view captures to GaussianBlendshapes. Training frames come first and are
     numbered without a gap; frames of other splits have later numbers; they are not part of the video, but keep pose
-    and camera for rendering. The head's rigid motion moves into the cameras (see `head.subject`): every frame has its
+    and camera for rendering. The head's rigid motion moves into the cameras (see `head.model`): every frame has its
     own camera, named after the one that recorded it, and a pose without rotation, neck and translation.
     """
     order = _order(clip)

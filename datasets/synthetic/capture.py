@@ -3,7 +3,7 @@
 A folder belongs to one set of settings. Each image is written atomically and depends only on those settings, so a
 killed run continues and gives the same capture.
 
-Every file has the same bytes on every x86-64 machine, with any number of threads (see `rounding` and `panels`).
+Every file has the same bytes on every x86-64 machine, with any number of threads (see `head.geometry` and `panels`).
 """
 
 from __future__ import annotations

@@ -223,7 +223,7 @@ class RestMesh:
 
 @dataclass(frozen=True, eq=False)
 class LatePoses:
-    """Delayed poses of hair and neck, see `lag`."""
+    """Delayed poses of hair and neck, see `history`."""
 
     hair: HeadPose
     neck: HeadPose

@@ -285,7 +285,7 @@ class VideoClip(NamedTuple):
         return tuple(self.faces.numbers[~self.faces.found].tolist())
 
     def found(self, timestep: int, camera: str, near: FloatArray | None) -> Iterator[FloatArray]:
-        """(L, 2) landmarks of a frame of the clip, pixels of the clip: a `tracking.network.Finder`."""
+        """(L, 2) landmarks of a frame of the clip, pixels of the clip: a `tracking.landmarks.Finder`."""
         yield self.pixels[timestep]
 
     def with_focal(self, focal: float) -> CaptureClip:
