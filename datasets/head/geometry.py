@@ -9,6 +9,7 @@ float64 are then exact in any order.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...bench.contracts import Camera, FloatArray, IntArray
 
@@ -107,6 +108,18 @@ def project(points: FloatArray, camera: Camera) -> FloatArray:
     seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     pixels: FloatArray = (seen @ camera.K.T)[:, :2] / np.maximum(seen[:, 2:], 1e-6)
     return pixels
+
+
+def project_facing(
+    points: FloatArray, normals: FloatArray, camera: Camera, cosine: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """(n, 2) pixels of points (n, 3), and (n,) whether each lies in the image with its normal within an angle of that
+    ``cosine`` to the camera."""
+    outward = camera.center - points
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    pixels = project(points, camera)
+    within = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    return pixels, ((normals * outward).sum(axis=1) > cosine) & within
 
 
 def rigid_alignment(points: FloatArray, wanted: FloatArray, weights: FloatArray | None = None) -> FloatArray:
