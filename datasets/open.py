@@ -20,7 +20,6 @@ from ..bench.registry import finds, get, readers, resolve
 from ..bench.specs import DatasetSpec
 from .clip import CaptureClip, as_capture
 from .ga.layout import ALL_FRAMES_FILE, SPLIT_FILES
-from .nersemble.names import is_subject
 
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
 ARCHIVES = (".7z", ".bz2", ".gz", ".rar", ".tar", ".tgz", ".xz", ".zip", ".zst")
@@ -112,6 +111,8 @@ def _captures_below(path: Path, names: list[str]) -> Foreign | None:
 
 
 def _nersemble(path: Path, names: list[str]) -> Foreign | None:
+    from .nersemble.names import is_subject  # only for what is no capture
+
     marks = ("sequences", "calibration", "camera_params.json")
     if any(mark in names for mark in marks) and is_subject(path.resolve().name):
         root, subjects = path.resolve().parent, [path.resolve().name]
