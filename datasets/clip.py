@@ -1,4 +1,17 @@
-"""A `Clip` over files on disk."""
+"""A `Clip` over files on disk.
+
+Masks of the parts of the tracked head in a frame: from the posed mesh by a z-buffer, and from the mask.
+
+* ``foreground``: pixels that the mask covers by half or more.
+* ``face``: the mesh's face, lips, eyes and the opening of the mouth, where the mesh does not hide them.
+* ``mouth``: the convex hull of the visible lips, so that teeth, tongue and the dark between them belong to it.
+* ``eyes``: eyeballs and the skin about them.
+* ``neck`` and ``ears``: those of the mesh, where it does not hide them.
+* ``hair``: the mesh's scalp, and foreground beyond the mesh whose nearest pixel of the mesh is scalp: hair extends
+  beyond the head. Hair beside the neck is included.
+
+Mouth and hair are limited to the foreground, if there is a mask. Regions are as accurate as the tracking.
+"""
 
 from __future__ import annotations
 
@@ -59,10 +72,8 @@ class HeadRegions:
         return tuple(name for name in PARTS if _NEEDED[name] in self._head.regions)
 
     def labels(self, camera: Camera, pose: HeadPose, mask: ByteArray | None) -> ByteArray:
-        """(H, W) 8-bit, one bit for each region that a pixel is in; see `select`.
-
-        ``mask`` is the (H, W) 8-bit coverage; with None nothing is foreground.
-        """
+        """(H, W) 8-bit, one bit for each region that a pixel is in; see `select`. ``mask`` is the (H, W) 8-bit
+        coverage; with None nothing is foreground."""
         front = rasterize_mesh(self._subject.meshes([pose])[0], self._head.faces, camera).face
         covered = front >= 0
         labels = np.where(covered, self._bits_of_faces[np.maximum(front, 0)], 0).astype(np.uint8)
@@ -127,10 +138,8 @@ def _beyond(covered: BoolArray, part: BoolArray) -> BoolArray:
 
 
 class FrameFiles(NamedTuple):
-    """Files of a frame's pixels, and its recorded key if a step changed the key.
-
-    A clip of an external reader may have no files; its pixels come from `CaptureClip.source`.
-    """
+    """Files of a frame's pixels, and its recorded key if a step changed the key. A clip of an external reader may have
+    no files; its pixels come from `CaptureClip.source`."""
 
     image: Path | None
     mask: Path | None
@@ -192,10 +201,8 @@ class CaptureClip:
         return digest(self.source_fingerprint, [*self.steps], splits, excluded, self.background)
 
     def image(self, key: FrameKey) -> ByteArray:
-        """(H, W, 3) 8-bit sRGB, composited on `background`; read-only, shared with the store.
-
-        Raises `InputError` for a key the clip does not have.
-        """
+        """(H, W, 3) 8-bit sRGB, composited on `background`; read-only, shared with the store. Raises `InputError` for a
+        key the clip does not have."""
         if self.pixel_steps:
             return self._processed(key, "image")
         files = self._files(key)
@@ -259,9 +266,9 @@ class CaptureClip:
 
     def _processed(self, key: FrameKey, part: Literal["image", "mask"]) -> ByteArray:
         """Image or mask of a frame after all pixel steps, read-only; both are cached because they are computed together."""
-        found = self.store.find((self.fingerprint, key, part))
-        if found is not None:
-            return found
+        cached = self.store.find((self.fingerprint, key, part))
+        if cached is not None:
+            return cached
         files = self._files(key)
         ground = self.background if self.read_background is None else self.read_background
         if files.image is None:
@@ -322,10 +329,8 @@ def check_apart(clip: CaptureClip, out: Path) -> None:
 
 
 def as_capture(clip: Clip) -> CaptureClip:
-    """Any clip as a `CaptureClip` for steps and commands; a `CaptureClip` is returned unchanged.
-
-    Pixels are read from ``clip``.
-    """
+    """Any clip as a `CaptureClip` for steps and commands; a `CaptureClip` is returned unchanged. Pixels are read from
+    ``clip``."""
     if isinstance(clip, CaptureClip):
         return clip
     where = f"clip {clip.subject}"

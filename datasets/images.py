@@ -1,4 +1,7 @@
-"""Reading and writing of images and masks, with a memory-bounded LRU cache of decoded ones."""
+"""Reading and writing of images and masks, with a memory-bounded LRU cache of decoded ones.
+
+The sRGB curve.
+"""
 
 from __future__ import annotations
 
@@ -124,8 +127,6 @@ def is_whole(path: Path, width: int, height: int) -> bool:
 
 
 def write_image(path: Path, image: ByteArray, *options: int) -> None:
-    """Write (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA, 8-bit, atomically; ``options`` are OpenCV's.
-
-    The suffix decides the format.
-    """
+    """Write (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA, 8-bit, atomically; ``options`` are OpenCV's. The suffix
+    decides the format."""
     write_bytes(path, encode_image(image, path.suffix, options, place=path))

@@ -1,4 +1,7 @@
-"""Opens captures of any layout; the reader is found in the registry by name or by the folder's content."""
+"""Opens captures of any layout; the reader is found in the registry by name or by the folder's content.
+
+Recognise other formats than captures and suggest a conversion, for error messages.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,6 @@ from ..bench.registry import finds, get, readers, resolve
 from ..bench.specs import DatasetSpec
 from .clip import CaptureClip, as_capture
 from .ga.layout import ALL_FRAMES_FILE, SPLIT_FILES
-from .nersemble.names import is_subject
 
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
 ARCHIVES = (".7z", ".bz2", ".gz", ".rar", ".tar", ".tgz", ".xz", ".zip", ".zst")
@@ -81,9 +83,9 @@ def _folder(path: Path) -> Foreign:
     if not names:
         return Foreign("an empty folder", "")
     for recognise in (_run, _captures_below, _nersemble, _tracked, _cameras_only, _unprepared, _nested):
-        found = recognise(path, names)
-        if found is not None:
-            return found
+        layout = recognise(path, names)
+        if layout is not None:
+            return layout
     some = ", ".join(name[:40] for name in names[:5])
     return Foreign(some + (", ..." if len(names) > 5 else ""), "")
 
@@ -109,6 +111,8 @@ def _captures_below(path: Path, names: list[str]) -> Foreign | None:
 
 
 def _nersemble(path: Path, names: list[str]) -> Foreign | None:
+    from .nersemble.names import is_subject  # only for what is no capture
+
     marks = ("sequences", "calibration", "camera_params.json")
     if any(mark in names for mark in marks) and is_subject(path.resolve().name):
         root, subjects = path.resolve().parent, [path.resolve().name]
@@ -203,16 +207,17 @@ def _quoted(path: Path) -> str:
 
 
 def find_reader(path: str | PathLike[str], name: str = "") -> DatasetSpec:
-    """The reader ``name``, see `registry.get`; without a name, the one that finds captures under ``path``."""
+    """The reader ``name``, see `registry.get`; without a name ga, unless only another one finds captures under ``path``."""
     if name:
         spec: DatasetSpec = get("datasets", name)
         return spec
     root = Path(path)
-    known = readers()
-    expected = f"a capture that a reader knows ({', '.join(known)})"
+    specs = readers()
+    expected = f"a capture that a reader knows ({', '.join(specs)})"
     if not root.exists():
         raise InputError(root, "", expected, "no such file or folder")
-    fitting = [spec for spec in known.values() if finds(spec, root)]
+    ga = specs.get("ga")
+    fitting = [ga] if ga and finds(ga, root) else [spec for spec in specs.values() if finds(spec, root)]
     if not fitting:
         raise InputError(root, "", expected, *describe(root))
     if len(fitting) > 1:
@@ -238,8 +243,8 @@ def open_clips(
     from ..bench.engine.captures import found_captures  # slow to import
 
     spec = find_reader(path, reader)
-    known = inspect.signature(resolve(spec.implementation)).parameters
-    given = {key: value for key, value in (wishes or {}).items() if key in known}
+    parameters = inspect.signature(resolve(spec.implementation)).parameters
+    given = {key: value for key, value in (wishes or {}).items() if key in parameters}
     given |= settings or {}
     for _, read in found_captures(spec, Path(path), given):
         yield as_capture(read(progress))
@@ -248,8 +253,8 @@ def open_clips(
 def open_clip(path: str | PathLike[str], reader: str = "", **options: Any) -> CaptureClip:
     """Read the one capture at ``path``; parameters and errors as of `open_clips`."""
     spec = find_reader(path, reader)
-    found = resolve(spec.find)(Path(path)) if spec.find else [Path(path)]
-    if len(found) > 1:
-        names = ", ".join(Path(one).name for one in found)
+    captures = resolve(spec.find)(Path(path)) if spec.find else [Path(path)]
+    if len(captures) > 1:
+        names = ", ".join(Path(one).name for one in captures)
         raise InputError(path, "", "one capture", names, "Name one capture.")
     return next(open_clips(path, reader, **options))

@@ -3,6 +3,10 @@
 pycolmap's own reader (4.2) does not check files: of 220 truncations of an ``images.bin``, 72 gave wrong values without an
 error and 9 did not terminate. It also needs a file of points, which many projects lack, and ends names at a space.
 
+Removal of lens distortion from images, so that a pinhole camera describes them. Lenses are named and parametrised as
+COLMAP does (its ``sensor/models.h``), which shares OpenCV's formulas. Pixel coordinates have the centre of the top left
+pixel at (0.5, 0.5), in COLMAP as here.
+
 Formats read:
 
 - COLMAP models, binary. Written by colmap/colmap (`src/colmap/scene/reconstruction_io_binary.cc`). Checked on
@@ -86,10 +90,8 @@ class Lens:
         return self._fisheye or bool(self._coefficients.any())
 
     def map_from(self, K: FloatArray, width: int, height: int) -> FloatArray:
-        """(height, width, 2) float32 position of each pixel of a pinhole image in the distorted one, pixels.
-
-        Far outside the calibrated view a polynomial may fold back into the image; such positions are moved outside.
-        """
+        """(height, width, 2) float32 position of each pixel of a pinhole image in the distorted one, pixels. Far
+        outside the calibrated view a polynomial may fold back into the image; such positions are moved outside."""
         # OpenCV's origin is the centre of the top left pixel.
         half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         undo = cv2.fisheye.initUndistortRectifyMap if self._fisheye else cv2.initUndistortRectifyMap
@@ -114,10 +116,8 @@ class Lens:
 
 
 def _unfolded(places: FloatArray, K: FloatArray) -> np.ndarray:
-    """(H, W) bool: connected region around the principal point in which a map keeps its orientation.
-
-    Outside a ring in which the lens's polynomial decreases it may increase again, mirrored twice.
-    """
+    """(H, W) bool: connected region around the principal point in which a map keeps its orientation. Outside a ring in
+    which the lens's polynomial decreases it may increase again, mirrored twice."""
     height, width = places.shape[:2]
     if min(width, height) < 2:
         return np.ones((height, width), dtype=bool)
@@ -130,10 +130,8 @@ def _unfolded(places: FloatArray, K: FloatArray) -> np.ndarray:
 
 
 def undistort_image(image: FloatArray, places: FloatArray, background: FloatArray | float) -> FloatArray:
-    """Resample a float32 image (H, W) or (H, W, 3) by a map of `Lens.map_from`; ``background`` outside of it.
-
-    Bicubic, with places rounded to 1/32 pixel, and clamped to [0, 1].
-    """
+    """Resample a float32 image (H, W) or (H, W, 3) by a map of `Lens.map_from`; ``background`` outside of it. Bicubic,
+    with places rounded to 1/32 pixel, and clamped to [0, 1]."""
     ground = [float(value) for value in np.broadcast_to(np.asarray(background, np.float64), (3,))]
     x, y = (np.ascontiguousarray(places[..., axis] - np.float32(0.5)) for axis in (0, 1))
     moved = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=ground)
@@ -367,11 +365,11 @@ def read_model(path: str | PathLike[str]) -> ColmapModel:
 
 def _by_number(file: Path, kind: str, entries: Iterable[tuple[int, T]]) -> dict[int, T]:
     """Cameras or images by id, validated and unique."""
-    found: dict[int, T] = {}
+    items: dict[int, T] = {}
     for number, entry in entries:
         key = f"{kind} {number}"
-        if number in found:
+        if number in items:
             raise InputError(file, key, f"each {kind} once", "a second one")
         entry.check(file, key)
-        found[number] = entry
-    return found
+        items[number] = entry
+    return items

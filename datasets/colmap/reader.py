@@ -14,6 +14,9 @@ each timestep, and their head model. `export colmap --tracking` writes such a da
 As here, the centre of the top left pixel is at (0.5, 0.5), and the world is mapped to the camera with OpenCV's axes.
 Position, orientation and scale of the world are those of the reconstruction, in metres only if it was made from metric
 poses; tracking must be in the same world.
+
+Write a clip as a COLMAP dataset: images, masks, and a sparse model with the tracked mesh as its points. Layout of
+``colmap`` and of radiance-field codes that read it: ``images/``, ``masks/``, ``sparse/0/``.
 """
 
 from __future__ import annotations
@@ -73,7 +76,7 @@ def model_cameras(
     "left to the images" gives the cameras of the undistorted images, which `undistort_clip` makes with `model_lenses`.
     """
     lenses = {number: _lens(model, number) for number in model.cameras}
-    found: dict[str, Camera] = {}
+    cameras: dict[str, Camera] = {}
     for number, image in sorted(model.images.items()):
         lens = lenses[image.camera]
         if lens.distorts and distortion == "refuse":
@@ -84,15 +87,15 @@ def model_cameras(
                 f"{lens.model} with parameters {', '.join(f'{value:g}' for value in lens.parameters)}",
                 "Undistort images and model together (`colmap image_undistorter`), or the clip by undistort_clip.",
             )
-        if image.name in found:
+        if image.name in cameras:
             expected = "image names that differ"
             raise InputError(model.folder, f"image {number}", expected, f"{image.name!r} again")
         world_to_camera = np.eye(4)
         w, x, y, z = image.quaternion
         world_to_camera[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
         world_to_camera[:3, 3] = image.translation
-        found[image.name] = Camera(image.name, lens.width, lens.height, lens.K, world_to_camera)
-    return found
+        cameras[image.name] = Camera(image.name, lens.width, lens.height, lens.K, world_to_camera)
+    return cameras
 
 
 def model_lenses(model: ColmapModel) -> dict[str, Lens]:
@@ -280,10 +283,8 @@ class _Observation(NamedTuple):
 
 
 def image_name(key: FrameKey, naming: Naming = "nested") -> str:
-    """Name of a frame in the model and its path under ``images/``.
-
-    "nested": subject/sequence/timestep/camera.png; "flat": sequence_timestep_camera.png.
-    """
+    """Name of a frame in the model and its path under ``images/``. "nested": subject/sequence/timestep/camera.png;
+    "flat": sequence_timestep_camera.png."""
     return f"{key}.png" if naming == "nested" else f"{key.sequence}_{key.timestep:05d}_{key.camera}.png"
 
 
@@ -396,10 +397,8 @@ def _add_points(model: Any, vertices: FloatArray, views: dict[int, _Observation]
 
 
 def _write_model(model: Any, folder: Path, model_format: ModelFormat) -> None:
-    """Write a model to a temporary folder, then copy its files, so that no file is incomplete.
-
-    Files of the other format are removed first because readers prefer binary files even if they are older.
-    """
+    """Write a model to a temporary folder, then copy its files, so that no file is incomplete. Files of the other
+    format are removed first because readers prefer binary files even if they are older."""
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
         if model_format == "bin":

@@ -126,10 +126,8 @@ REST = "REST"
 
 
 def canonical(head: HeadArrays) -> HeadPose:
-    """The face at rest with an open mouth, as VHAP's canonical parameters have it: unlike the frames of any signal at rest.
-
-    Splits of a capture must not share images.
-    """
+    """The face at rest with an open mouth, as VHAP's canonical parameters have it: unlike the frames of any signal at
+    rest. Splits of a capture must not share images."""
     return replace(resting(head), jaw=np.array(CANONICAL_JAW))
 
 
@@ -166,10 +164,8 @@ def write_driven_video(path: Path, renderer: Renderer, clip: CaptureClip, fps: f
 
 
 def write_driven_capture(out: Path, renderer: Renderer, clip: CaptureClip) -> Path:
-    """Write the frames and poses of a clip in the GaussianAvatars layout; return the folder for readers.
-
-    The driven sequence is held out for self-reenactment; the sequence `REST` is for training.
-    """
+    """Write the frames and poses of a clip in the GaussianAvatars layout; return the folder for readers. The driven
+    sequence is held out for self-reenactment; the sequence `REST` is for training."""
     keys = list(clip.splits["self_reenactment"])
     sequences: dict[str, list[HeadPose]] = {}
     places = []
@@ -202,10 +198,8 @@ _JAW = JOINT_NAMES.index("jaw")
 
 
 class DrivenMeasures:
-    """Measures on the vertices of one subject.
-
-    ``shape``: (S,) identity of the avatar. ``static_offset``: (V, 3) metres.
-    """
+    """Measures on the vertices of one subject. ``shape``: (S,) identity of the avatar. ``static_offset``: (V, 3)
+    metres."""
 
     def __init__(self, head: HeadArrays, shape: FloatArray, static_offset: FloatArray):
         self._subject = PosedSubject(head, shape, static_offset)
@@ -236,11 +230,11 @@ class DrivenMeasures:
         """(T,) smallest distances between the middle of the upper and the lower lip, millimetres; None for heads without lips."""
         if self._lips is None:
             return None
-        both, count, found = np.concatenate(self._lips), len(self._lips[0]), []
+        both, count, distances = np.concatenate(self._lips), len(self._lips[0]), []
         for mesh in self._meshes(poses, both):
             gaps = mesh[:count, None] - mesh[None, count:]
-            found.append(np.linalg.norm(gaps, axis=2).min())
-        return _MILLIMETRES * np.array(found)
+            distances.append(np.linalg.norm(gaps, axis=2).min())
+        return _MILLIMETRES * np.array(distances)
 
     def _meshes(self, poses: Sequence[HeadPose], vertices: IntArray) -> Iterator[FloatArray]:
         """(n, 3) vertices of each pose."""
@@ -287,8 +281,10 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
         sizes = {(camera.width, camera.height) for camera in scene.clip.cameras.values()}
         if is_video and any(side % 2 for size in sizes for side in size):
             remedy = "Write a folder, or leave out --capture."
-            shown = " and ".join(f"{width}x{height}" for width, height in sizes)
-            raise InputError("command line", "--capture", "a camera of even size, for a video", shown, remedy)
+            size_text = " and ".join(f"{width}x{height}" for width, height in sizes)
+            raise InputError(
+                "command line", "--capture", "a camera of even size, for a video", size_text, remedy
+            )
         start = time.perf_counter()
         request = SignalRequest(
             Path(settings.signal),
@@ -305,11 +301,11 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
         regular, filled = resampled(request.path, signal.poses, signal.timing, fps)
         signal = replace(signal, poses=regular)
         window_length(len(signal.poses), settings.smooth, fps)
-        found = transfer(signal, scene.head, settings.neutral, progress)
-        moving = head_motion(found.poses, settings.still_head)
+        transferred = transfer(signal, scene.head, settings.neutral, progress)
+        moving = head_motion(transferred.poses, settings.still_head)
         driven = smoothed(moving, settings.smooth, fps)
         transfer_ms = 1e3 * (time.perf_counter() - start) / len(driven)
-        data = measured(settings, scene, signal, found, (moving, driven))
+        data = measured(settings, scene, signal, transferred, (moving, driven))
         data |= {"fps": fps, "interpolated": filled, "transfer_ms": round(transfer_ms, 2)}
         poses = dict(enumerate(scene.placed([*driven, canonical(scene.head)])))
         sequences = dict.fromkeys(poses, SEQUENCE) | {len(driven): REST}
@@ -343,10 +339,8 @@ def measured(
     found: Transferred,
     motion: tuple[Any, Any],
 ) -> dict[str, Any]:
-    """Measures of the driven poses as plain values, and the channels of the signal that drive nothing.
-
-    ``motion`` has the poses before and after smoothing.
-    """
+    """Measures of the driven poses as plain values, and the channels of the signal that drive nothing. ``motion`` has
+    the poses before and after smoothing."""
     measures = DrivenMeasures(scene.head, scene.clip.shape, scene.clip.static_offset)
     before, after = motion
     reference = settings.neutral or 0
@@ -408,9 +402,9 @@ def report_text(data: dict[str, Any]) -> str:
     ]
     if filled:
         count = sum(last - first + 1 for first, last in filled)
-        shown = ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last in filled)
+        ranges = ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last in filled)
         what = f"{count} of {data['frames']} frames, without a face or missing in the signal"
-        lines.insert(2, f"  interpolated    {what}: {shown}")
+        lines.insert(2, f"  interpolated    {what}: {ranges}")
     reasons: dict[str, list[str]] = {}
     for channel, reason in data["unused"].items():
         reasons.setdefault(reason, []).append(channel)

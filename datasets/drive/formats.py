@@ -118,14 +118,14 @@ def read_coefficients(request: SignalRequest) -> DrivingSignal:
     """Coefficients of each frame with a face. Identity is ignored."""
     table = request.columns
     head = request.head(DEFAULT_HEAD)
-    found = {part: next((n for n in names if n in table.columns), "") for part, names in NAMES.items()}
-    table = table.with_face([name for name in found.values() if name])
-    if not found["expression"]:
+    column_of = {part: next((n for n in names if n in table.columns), "") for part, names in NAMES.items()}
+    table = table.with_face([name for name in column_of.values() if name])
+    if not column_of["expression"]:
         expected = f"expression coefficients: {', '.join(NAMES['expression'])}"
         raise InputError(table.path, "", expected, ", ".join(sorted(table.columns)))
-    values = {part: table.values(name) for part, name in found.items() if name}
-    parts = _parts(table, values, found)
-    taken = {part: name for part, name in found.items() if name and _drives(part, parts, values)}
+    values = {part: table.values(name) for part, name in column_of.items() if name}
+    parts = _parts(table, values, column_of)
+    taken = {part: name for part, name in column_of.items() if name and _drives(part, parts, values)}
     used = {*taken.values()}
     unused = {
         name: "identity" if name in IDENTITY else "no coefficient of the pose"
@@ -133,7 +133,7 @@ def read_coefficients(request: SignalRequest) -> DrivingSignal:
         if name not in (*used, table.timing.column)
     }
     if "eyelids" in parts and head.eyelid_basis is None:
-        unused[found["eyelids"]] = NO_EYELIDS
+        unused[column_of["eyelids"]] = NO_EYELIDS
     return DrivingSignal("coefficients", head, make_poses(table.path, head, parts), table.timing, unused)
 
 
@@ -214,8 +214,8 @@ def _coefficients(source: Path, head: HeadArrays, sums: Mapping[str, FloatArray]
         elif match and int(match[2]) < sizes.get(match[1], 0):
             parts[match[1]][:, int(match[2])] += values
         else:
-            known = [f"{part}.{n}" for part, size in sizes.items() for n in range(size)]
-            raise unknown(str(source), "coefficients", name, [*named, *known])
+            coefficients = [f"{part}.{n}" for part, size in sizes.items() for n in range(size)]
+            raise unknown(str(source), "coefficients", name, [*named, *coefficients])
     return parts
 
 
@@ -264,8 +264,8 @@ def read_signal(request: SignalRequest, name: str = "") -> DrivingSignal:
     path = request.path
     if not path.exists():
         raise InputError(path, "", "a signal", "no such file or folder")
-    known = readers().values() if path.is_dir() else ()
-    if name == "capture" or (not name and not request.map and any(finds(spec, path) for spec in known)):
+    specs = readers().values() if path.is_dir() else ()
+    if name == "capture" or (not name and not request.map and any(finds(spec, path) for spec in specs)):
         return read_capture_signal(request)
     if request.sequence:
         raise InputError("command line", "--sequence", "a signal that is a capture", str(path))

@@ -13,10 +13,8 @@ MOST_SIZE = 4096
 
 @dataclass(frozen=True)
 class DriveSettings(CaptureOptions):
-    """Drive a stored avatar with a signal, and write a video, or a capture of its frames and FLAME parameters.
-
-    Prints jitter, identity spill, lip closure and latency, and the channels of the signal without effect.
-    """
+    """Drive a stored avatar with a signal, and write a video, or a capture of its frames and FLAME parameters. Prints
+    jitter, identity spill, lip closure and latency, and the channels of the signal without effect."""
 
     avatar: AvatarFolder
 

@@ -1,4 +1,25 @@
-"""A driving signal as poses of a head model."""
+"""A driving signal as poses of a head model.
+
+The 52 blendshapes of ARKit and MediaPipe, and their effect on a head model with jaw and eye joints. FLAME has no such
+shapes. They are applied to a head that has them, the embedded one or one with ARKit's expression names such as
+ICT-FaceKit's, and its vertices are transferred to the avatar's head.
+
+Formats read:
+
+- Live Link Face CSV. Written by Epic Games' Live Link Face for iPhone, and like it by AnimaVR/NeuroSync_Player
+  (`utils/csv/save_csv.py`). Checked on alexdjulin/LiveLinkFace-CSV-Retarget-For-Motionbuilder@6492a4a1 `anim/alex_rom_3.csv`
+  and AnimaVR/NeuroSync_Player@f31b8fad `livelink/animations/Sad/MySlate_167_iPhone_cal.csv`.
+- MediaPipe Face Landmarker results, JavaScript. Written by google-ai-edge/mediapipe
+  (`mediapipe/tasks/web/vision/face_landmarker`). Not checked on a file of the program.
+- MediaPipe Face Landmarker results, Python and Unity. Written by google-ai-edge/mediapipe
+  (`mediapipe/tasks/python/vision/face_landmarker.py`) and homuler/MediaPipeUnityPlugin. Not checked on a file of the program.
+- Audio2Face-3D CSV. Written by NVIDIA/Audio2Face-3D-Samples
+  (`scripts/audio2face_3d_api_client/a2f_3d/client/service.py`). Checked on walkoncross/NIM-audio2face-visualization@e563d13b
+  `viz-threejs/assets/animation_frames.csv`.
+- Audio2Face JSON. Written by NVIDIA Omniverse Audio2Face. Not checked on a file of the program.
+- LAM JSON. Written by aigc3d/LAM_Audio2Expression (`models/utils.py`). Checked on aigc3d/LAM_WebRender@12174e94
+  `asset/test_expression_1s.json`.
+"""
 
 from __future__ import annotations
 
@@ -88,10 +109,8 @@ def _loaded(name: str) -> HeadArrays:
 
 
 def make_poses(path: Path, head: HeadArrays, parts: Mapping[str, FloatArray]) -> list[HeadPose]:
-    """Poses of (T, n) arrays by name: expression, eyelids and those of `POSE_PARTS`; missing ones are 0.
-
-    Fewer expression coefficients than the head model has are padded with zeros; eyelids are left out if it has no basis.
-    """
+    """Poses of (T, n) arrays by name: expression, eyelids and those of `POSE_PARTS`; missing ones are 0. Fewer
+    expression coefficients than the head model has are padded with zeros; eyelids are left out if it has no basis."""
     length = len(next(iter(parts.values())))
     size = head.expression_basis.shape[2]
     lids = 0 if head.eyelid_basis is None else head.eyelid_basis.shape[2]
@@ -198,11 +217,11 @@ def is_blendshapes(table: SignalTable) -> bool:
 
 def read_blendshapes(request: SignalRequest) -> DrivingSignal:
     """Blendshapes of each frame with a face."""
-    known = {name: arkit_name(name) for name in request.columns.columns}
-    table = request.columns.with_face([name for name, arkit in known.items() if arkit])
+    arkit_names = {name: arkit_name(name) for name in request.columns.columns}
+    table = request.columns.with_face([name for name, arkit in arkit_names.items() if arkit])
     unused = {}
     for name in table.columns:
-        if not known[name] and name != table.timing.column:
+        if not arkit_names[name] and name != table.timing.column:
             similar = get_close_matches(name.lower(), [*_SPELLINGS], 1, MISSPELT)
             if similar:
                 expected = f"ARKit's name {_SPELLINGS[similar[0]]}"
@@ -210,7 +229,7 @@ def read_blendshapes(request: SignalRequest) -> DrivingSignal:
                 raise InputError(table.path, "columns", expected, repr(name), remedy)
             unused[name] = "no blendshape"
     channels: dict[str, FloatArray] = {}
-    for name, arkit in known.items():
+    for name, arkit in arkit_names.items():
         if arkit:
             if arkit in channels:
                 raise InputError(table.path, "columns", f"one column for {arkit}", "two")
@@ -228,10 +247,8 @@ def read_blendshapes(request: SignalRequest) -> DrivingSignal:
 def apply_blendshapes(
     request: SignalRequest, channels: Mapping[str, FloatArray], timing: Timing
 ) -> DrivingSignal:
-    """Poses of the head that performs the blendshapes: the one given, else the embedded one.
-
-    ``channels``: (T,) values by ARKit's name.
-    """
+    """Poses of the head that performs the blendshapes: the one given, else the embedded one. ``channels``: (T,) values
+    by ARKit's name."""
     if request.signal_head:
         head = request.head()
     elif is_embedded(request.target):
@@ -262,20 +279,22 @@ def is_embedded(head: HeadArrays) -> bool:
 
 def blendshape_parts(head: HeadArrays) -> dict[str, dict[str, FloatArray]]:
     """Effect of each blendshape at 1 on the parts of a pose, by name: expression (E,), jaw (3,), eyes (6,), eyelids (2,)."""
-    found: dict[str, dict[str, FloatArray]] = {name: _joint(weights) for name, weights in JOINTS.items()}
+    weights_by_shape: dict[str, dict[str, FloatArray]] = {
+        name: _joint(weights) for name, weights in JOINTS.items()
+    }
     if is_embedded(head):
-        return found | _embedded_parts(head.version)
+        return weights_by_shape | _embedded_parts(head.version)
     columns = _named_columns(head)
     if not columns:
         expected = "the embedded head, or one with expressions of ARKit's names such as ICT-FaceKit's"
         raise InputError("command line", "--signal-head", expected, head.version)
     for name, direction in columns.items():
         if name == "jawOpen":  # the shape replaces the joint
-            found.pop(name)
-        found.setdefault(name, {})["expression"] = direction
+            weights_by_shape.pop(name)
+        weights_by_shape.setdefault(name, {})["expression"] = direction
     if "jawLeft" in columns:
-        del found["jawLeft"]["jaw"], found["jawRight"]["jaw"]
-    return found
+        del weights_by_shape["jawLeft"]["jaw"], weights_by_shape["jawRight"]["jaw"]
+    return weights_by_shape
 
 
 @cache
@@ -287,14 +306,14 @@ def _embedded_head() -> HeadArrays:
 def _embedded_parts(version: str) -> dict[str, dict[str, FloatArray]]:
     """Parts of the shapes of a version of the embedded head."""
     matrix, lids = semantic_to_coefficients(version)
-    found = {}
+    rotations = {}
     for name, shapes in _EMBEDDED.items():
         rows = [SEMANTIC_NAMES.index(shape) for shape in shapes]
         weights = np.array([*shapes.values()])
-        found[name] = {"expression": weights @ matrix[rows]}
+        rotations[name] = {"expression": weights @ matrix[rows]}
         if lids is not None:
-            found[name]["eyelids"] = weights @ lids[rows]
-    return found
+            rotations[name]["eyelids"] = weights @ lids[rows]
+    return rotations
 
 
 def _joint(weights: Mapping[str, float]) -> dict[str, FloatArray]:
@@ -308,10 +327,10 @@ def _joint(weights: Mapping[str, float]) -> dict[str, FloatArray]:
 
 def _named_columns(head: HeadArrays) -> dict[str, FloatArray]:
     """(E,) directions by ARKit's name of the head's named expressions; ``_L`` and ``_R`` stand for Left and Right."""
-    found: dict[str, FloatArray] = {}
+    shapes: dict[str, FloatArray] = {}
     for name, column in zip(head.expression_names, np.eye(len(head.expression_names))):
         # browInnerUp is one shape in ARKit and a pair in others
         arkit = arkit_name(name) or arkit_name(re.sub("_[LR]$", "", name))
         if arkit:
-            found[arkit] = found.get(arkit, 0.0) + column
-    return found
+            shapes[arkit] = shapes.get(arkit, 0.0) + column
+    return shapes

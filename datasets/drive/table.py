@@ -1,6 +1,8 @@
 """Tables of values over time: CSV, JSON, JSON lines, npz, and folders with one file per frame.
 
 A table has a row for each frame of the file. Rows without a face have empty values, and `SignalTable.with_face` leaves them out.
+
+Names of the arrays of FLAME coefficients in the outputs of trackers.
 """
 
 from __future__ import annotations
@@ -112,10 +114,8 @@ class SignalTable:
         )
 
     def values(self, name: str) -> FloatArray:
-        """(T, n) float64 values of a column; n is 1 for single numbers.
-
-        Raises `InputError` for values that are not finite numbers within `MAX_MAGNITUDE`, and for frames of unequal length.
-        """
+        """(T, n) float64 values of a column; n is 1 for single numbers. Raises `InputError` for values that are not
+        finite numbers within `MAX_MAGNITUDE`, and for frames of unequal length."""
         column = self.columns[name]
         if len(column) != len(self):
             raise InputError(self.path, name, f"{len(self)} frames, as other columns have", str(len(column)))
@@ -163,9 +163,7 @@ class SignalTable:
 
 def read_table(path: Path, fps: float | None = None) -> SignalTable:
     """Read a file by its ending, or a folder with files of each frame. Times are those of a column, if there are any.
-
-    With ``fps``, frames per second, a column of times that gives no rate is no error.
-    """
+    With ``fps``, frames per second, a column of times that gives no rate is no error."""
     read = _folder if path.is_dir() else _READERS.get(path.suffix.lower())
     if read is None:
         expected = f"a file in {', '.join(_READERS)}, or a folder"
@@ -231,13 +229,13 @@ def _categories(face: Any) -> dict[str, Any] | None:
     items = face.get(_CATEGORIES) if isinstance(face, dict) else face
     if not isinstance(items, list) or not items or not all(isinstance(item, dict) for item in items):
         return None
-    found = {}
+    columns = {}
     for item in items:
         names = [item[key] for key in _CATEGORY_NAMES if isinstance(item.get(key), str)]
         if not names or _SCORE not in item:
             return None
-        found[names[0]] = item[_SCORE]
-    return found
+        columns[names[0]] = item[_SCORE]
+    return columns
 
 
 def _csv(path: Path) -> SignalTable:

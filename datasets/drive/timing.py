@@ -66,9 +66,9 @@ class Timing:
     def of_seconds(cls, seconds: FloatArray, column: str = "") -> Timing:
         """Frames at increasing times. Their rate is one of `RATES` near the usual step, or its mean without gaps."""
         steps = np.diff(seconds)
-        found = [1.0 / np.median(steps), 1.0 / steps[steps < GAP * np.median(steps)].mean()]
-        near = [rate for fps in found for rate in RATES if abs(fps - rate) <= NEAR * rate]
-        fps = float((near or found[1:])[0])
+        rates = [1.0 / np.median(steps), 1.0 / steps[steps < GAP * np.median(steps)].mean()]
+        near = [rate for fps in rates for rate in RATES if abs(fps - rate) <= NEAR * rate]
+        fps = float((near or rates[1:])[0])
         positions = (seconds - seconds[0]) * fps
         if (
             steps.min() * fps < 0.5 and abs(positions[-1] - len(steps)) < 0.5
@@ -87,10 +87,8 @@ def natural_order(path: Path) -> list[tuple[bool, int | str]]:
 
 
 def in_order(paths: Sequence[Path]) -> tuple[list[Path], Timing]:
-    """Files or folders of one frame each by the number of the frame in their names, and their times.
-
-    The frame's is the first number that varies; some or all names may have a second, such as a face's.
-    """
+    """Files or folders of one frame each by the number of the frame in their names, and their times. The frame's is the
+    first number that varies; some or all names may have a second, such as a face's."""
     paths = sorted(paths, key=natural_order)
     numbers = [[int(part) for part in re.findall(r"\d+", path.stem)] for path in paths]
     varying = [values for values in zip(*numbers) if len({*values}) > 1]
@@ -151,10 +149,8 @@ def from_columns(
 
 
 def _seconds(column: Sequence[Any]) -> FloatArray | None:
-    """(T,) seconds of clock times, timecodes or numbers, whose unit follows from the rate; None for other values.
-
-    The rate of timecodes is the lowest above all their numbers of frames; within one second they give none.
-    """
+    """(T,) seconds of clock times, timecodes or numbers, whose unit follows from the rate; None for other values. The
+    rate of timecodes is the lowest above all their numbers of frames; within one second they give none."""
     clocks = [_CLOCK.fullmatch(str(value).strip()) for value in column]
     values, units = _finite(column), UNITS
     if all(clocks):

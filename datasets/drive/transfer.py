@@ -1,4 +1,7 @@
-"""Transfer of a signal to the head model of an avatar, relative to the signal's neutral face, and smoothing over time."""
+"""Transfer of a signal to the head model of an avatar, relative to the signal's neutral face, and smoothing over time.
+
+Signals whose frames arrive one by one, as lines of JSON.
+"""
 
 from __future__ import annotations
 
@@ -188,12 +191,12 @@ def resampled(
     rotations = rotation_of(np.array([pose.rotation for pose in poses]))
     turns = (rotations[before].inv() * rotations[after]).as_rotvec()
     columns["rotation"] = (rotations[before] * rotation_of(share * turns)).as_rotvec()
-    made = [
+    converted = [
         replace(poses[row], **{name: values[number] for name, values in columns.items()})
         for number, row in enumerate(before)
     ]
     filled = np.flatnonzero(np.diff(nearest > GAP / 2, prepend=False, append=False)).reshape(-1, 2)
-    return made, [(int(first), int(end) - 1) for first, end in filled]
+    return converted, [(int(first), int(end) - 1) for first, end in filled]
 
 
 def window_length(frames: int, seconds: float, fps: float) -> int:
@@ -242,9 +245,7 @@ def _eyelids(pose: HeadPose, target: HeadArrays) -> FloatArray | None:
 
 class LiveDriver:
     """Converts lines of one frame each (coefficients or blendshapes, as for `read_signal`) to poses of a head model.
-
-    ``target``: Head model of the avatar. ``signal_head``: See `settings.DriveSettings`.
-    """
+    ``target``: Head model of the avatar. ``signal_head``: See `settings.DriveSettings`."""
 
     def __init__(self, target: HeadAsset, signal_head: str = ""):
         if not isinstance(target, HeadArrays):

@@ -4,6 +4,11 @@ VHAP shifts the world of each sequence by the mean of its tracked translation an
 A union of sequences therefore states each camera once per sequence, in worlds that differ by a translation.
 Here that translation is recovered from the cameras, so that a clip has one position per camera; the poses of shifted
 sequences must be moved accordingly.
+
+Infer from the images whether ``cy`` is measured from the top or the bottom edge. VHAP changed the convention in
+November 2024, and its files do not state it. The two conventions differ by h - 2 cy pixels in every projection, so the
+outline of the tracked mesh matches the outline of the foreground for only one of them. Hair and clothes hide parts of
+the outline; the visible ones (brow, nose, chin, cheeks, ears) are decisive.
 """
 
 from __future__ import annotations

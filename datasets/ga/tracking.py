@@ -107,10 +107,8 @@ def pose_to_parameters(pose: HeadPose) -> dict[str, FloatArray]:
 
 @dataclass(frozen=True, eq=False)
 class Tracking:
-    """Content of the parameter files, and the head that they belong to (with teeth appended if needed).
-
-    ``notes`` records decisions about properties that the layout does not define.
-    """
+    """Content of the parameter files, and the head that they belong to (with teeth appended if needed). ``notes``
+    records decisions about properties that the layout does not define."""
 
     head: HeadArrays
     poses: Mapping[int, HeadPose]
@@ -139,10 +137,8 @@ def read_tracking(
 
 
 class TrackingReading:
-    """Parameters of timesteps that are added one after the other; see `read_tracking`.
-
-    Identity, teeth and static offset are those of the first file that is accepted.
-    """
+    """Parameters of timesteps that are added one after the other; see `read_tracking`. Identity, teeth and static
+    offset are those of the first file that is accepted."""
 
     def __init__(self, head: HeadArrays, subject: str, teeth: TeethPolicy = "auto") -> None:
         self.head, self._subject, self._teeth = head, subject, teeth
@@ -242,10 +238,8 @@ def _eyelids(where: Path, head: HeadArrays, closed: float) -> dict[str, str]:
 def resolve_teeth(
     head: HeadArrays, rows: int | None, teeth: TeethPolicy, file: Path
 ) -> tuple[HeadArrays, int]:
-    """Match head and static offset: returns the head to use, and the number of rows of the offset to use.
-
-    ``rows`` is the number of rows of the files' static offset, None without one.
-    """
+    """Match head and static offset: returns the head to use, and the number of rows of the offset to use. ``rows`` is
+    the number of rows of the files' static offset, None without one."""
     vertices = len(head.template)
     if teeth != "keep" and not len(head.regions.get("teeth", ())):
         required = teeth == "add" or head.version.startswith("flame") or (rows or 0) > vertices

@@ -94,10 +94,8 @@ RAISED = Faults()
 
 
 def read_transforms(path: Path, faults: Faults = RAISED) -> list[FrameEntry]:
-    """Read and check the frames of a transforms JSON.
-
-    Faults are invalid JSON, missing keys, values of the wrong type or range, and matrices that are not rigid motions.
-    """
+    """Read and check the frames of a transforms JSON. Faults are invalid JSON, missing keys, values of the wrong type
+    or range, and matrices that are not rigid motions."""
     entries: list[FrameEntry] = []
     with faults.of("json"):
         document = read_json(path)
@@ -113,10 +111,8 @@ def read_transforms(path: Path, faults: Faults = RAISED) -> list[FrameEntry]:
 
 
 def check_lenses(path: Path, document: Mapping[str, Any]) -> None:
-    """Raise `InputError` if a transforms JSON has lenses other than pinholes, by the keys of nerfstudio.
-
-    Renders have no distortion and cannot be compared with distorted images.
-    """
+    """Raise `InputError` if a transforms JSON has lenses other than pinholes, by the keys of nerfstudio. Renders have
+    no distortion and cannot be compared with distorted images."""
     frames = document.get("frames")
     parts = [("", document)]
     parts += (
@@ -154,11 +150,8 @@ UNDISTORT = (
 
 
 def parse_frame(path: Path, where: str, frame: Any, document: Mapping[str, Any]) -> FrameEntry:
-    """Read and check one frame of the document at ``path``; see `read_transforms`.
-
-    ``where``: JSON path of the frame, for messages. ``document``: The whole document, which may state intrinsics for all
-    frames.
-    """
+    """Read and check one frame of the document at ``path``; see `read_transforms`. ``where``: JSON path of the frame,
+    for messages. ``document``: The whole document, which may state intrinsics for all frames."""
     if not isinstance(frame, dict):
         raise InputError(path, where, "an object", type(frame).__name__)
     reader = _FrameReader(path, where, frame, document)
@@ -226,8 +219,8 @@ class _FrameReader:
         return InputError(self._path, f"{self._where}.{key}", expected, found_entry(self._get(key)))
 
     def _get(self, key: str) -> Any:
-        own = self._frame.get(key)
-        return self._document.get(key) if own is None else own
+        value = self._frame.get(key)
+        return self._document.get(key) if value is None else value
 
     def text(self, key: str) -> str:
         value = self._frame.get(key)

@@ -1,6 +1,11 @@
 """Checks of a whole capture before any long work: images, timesteps, leaks between splits.
 
 Each fault is an `InputError` with file, entry, expected and found value.
+
+Digests of file contents, stored in the user's cache and valid while the files are unchanged. JSON, npz and text are
+digested in a form that does not depend on the program that wrote the same content: white space, order of keys and
+arrays, compression, 1 for 1.0, and the spelling of paths and camera ids. For files of headbench it is the file's own
+bytes. Other files, such as images, are digested as they are.
 """
 
 from __future__ import annotations
@@ -136,9 +141,9 @@ def content_digests(
     """
     paths = sorted(set(files))
     place = _place(cached_for) if cached_for else None
-    known = _read_cache(place) if place else {}
+    cached = _read_cache(place) if place else {}
     stamps = {path: Stamp.of(path) for path in paths}
-    result = {path: known[_name(stamps[path])] for path in paths if _name(stamps[path]) in known}
+    result = {path: cached[_name(stamps[path])] for path in paths if _name(stamps[path]) in cached}
     missing = [path for path in paths if path not in result]
     with ThreadPoolExecutor(_THREADS) as pool:
         for done, (path, value) in enumerate(zip(missing, pool.map(digest_content, missing)), start=1):
@@ -154,10 +159,8 @@ def content_digests(
 def digests_of_same_size(
     splits: Mapping[str, Sequence[Path]], *, progress: Progress = no_progress
 ) -> dict[Path, str]:
-    """Digests as by `content_digests` of the files that have the same size as one of another split.
-
-    Paths that name no file are left out.
-    """
+    """Digests as by `content_digests` of the files that have the same size as one of another split. Paths that name no
+    file are left out."""
     sizes = {path: path.stat().st_size for part in splits.values() for path in part if path.is_file()}
     splits_of: dict[int, set[str]] = defaultdict(set)
     for split, part in splits.items():
@@ -255,10 +258,8 @@ def _check_size(entry: FrameEntry, path: Path, info: ImageInfo, image: ImageInfo
 
 
 def check_timesteps(folder: Path, entries: Sequence[FrameEntry]) -> None:
-    """Check that timesteps are numbered from 0 without a gap, each with one parameter file and one sequence.
-
-    Readers of the layout index arrays by timestep, so a gap would shift all following parameters.
-    """
+    """Check that timesteps are numbered from 0 without a gap, each with one parameter file and one sequence. Readers of
+    the layout index arrays by timestep, so a gap would shift all following parameters."""
     timesteps = timesteps_of(entries)
     if not entries:
         raise InputError(folder, "frames", "at least one frame", "none")
@@ -293,12 +294,12 @@ def find_leaks(
     """
     parts = {split: [images[key] for key in keys] for split, keys in splits.items()}
     contents = digests_of_same_size(parts, progress=progress)
-    found = []
+    leaks = []
     for one, other in combinations(splits, 2):
         names = f"{one} and {other}"
         shared = sorted({images[key] for key in splits[one]} & {images[key] for key in splits[other]})
         if shared:
-            found.append(
+            leaks.append(
                 f"{len(shared)} image files are in both {names}, such as {'/'.join(shared[0].parts[-3:])}"
             )
             continue
@@ -306,17 +307,17 @@ def find_leaks(
         equal = [key for key in splits[other] if contents.get(images[key]) in by_content]
         if equal:
             first = by_content[contents[images[equal[0]]]]
-            found.append(
+            leaks.append(
                 f"{counted(len(equal), 'image')} of the same content in {names}, such as {first} and {equal[0]}"
             )
     train = splits.get("train", ())
     timesteps = sorted({k.timestep for k in train} & {k.timestep for k in splits.get("self_reenactment", ())})
     if timesteps:
-        found.append(f"{len(timesteps)} self-reenactment timesteps are trained on, such as {timesteps[0]}")
+        leaks.append(f"{len(timesteps)} self-reenactment timesteps are trained on, such as {timesteps[0]}")
     cameras = sorted({k.camera for k in train} & {k.camera for k in splits.get("novel_view", ())})
     if cameras:
-        found.append(f"novel-view cameras are trained on: {', '.join(cameras)}")
-    return found
+        leaks.append(f"novel-view cameras are trained on: {', '.join(cameras)}")
+    return leaks
 
 
 def check_leaks(folder: Path, leaks: list[str], policy: LeakPolicy) -> list[str]:
@@ -328,10 +329,8 @@ def check_leaks(folder: Path, leaks: list[str], policy: LeakPolicy) -> list[str]
 
 
 def sequence_names(entries: Iterable[FrameEntry], declared: Mapping[str, str]) -> dict[str, str]:
-    """Sequence name by sequence folder: the declared one, else the one in the folder's name.
-
-    Folders whose names give the same sequence keep their full names.
-    """
+    """Sequence name by sequence folder: the declared one, else the one in the folder's name. Folders whose names give
+    the same sequence keep their full names."""
     folders = sorted({entry.sequence_folder for entry in entries})
     names = {folder: declared.get(folder) or parse_sequence_folder(folder)[1] for folder in folders}
     taken = [*names.values()]
@@ -386,10 +385,8 @@ def _match(file: Path, wanted: str, available: Sequence[str]) -> str:
 
 
 def require_full_grid(clip: CaptureClip, source: str | Path = "") -> None:
-    """Check that every camera has a frame at every timestep; excluded frames count as existing.
-
-    ``source``: The capture that the clip was read from, for the message.
-    """
+    """Check that every camera has a frame at every timestep; excluded frames count as existing. ``source``: The capture
+    that the clip was read from, for the message."""
     timesteps = sorted({(key.sequence, key.timestep) for key in clip.files})
     wanted = (
         FrameKey(clip.subject, sequence, timestep, camera)

@@ -50,10 +50,8 @@ OPTIONAL = ("eyelid_basis", "uv")
 
 @dataclass(frozen=True, eq=False)
 class HeadArrays:
-    """A head model in FLAME's layout (a `HeadAsset`). Units: metres.
-
-    V vertices, F triangles, S identity and E expression directions, J joints in the order of `JOINT_NAMES`.
-    """
+    """A head model in FLAME's layout (a `HeadAsset`). Units: metres. V vertices, F triangles, S identity and E
+    expression directions, J joints in the order of `JOINT_NAMES`."""
 
     version: str
     """Name of the expression basis, equal to ``HeadPose.head_model`` of its poses."""
@@ -85,10 +83,7 @@ class HeadArrays:
     chart."""
 
     def validate(self, file: str | PathLike[str]) -> HeadArrays:
-        """Validate the model and return self.
-
-        ``file``: Source of the arrays, named in the error.
-        """
+        """Validate the model and return self. ``file``: Source of the arrays, named in the error."""
         arrays = {name: np.asarray(getattr(self, name)) for name in STORED} | self._optional()
         sizes = {"J": len(JOINT_NAMES), "9 (J - 1)": 9 * (len(JOINT_NAMES) - 1)}
         sizes = check_arrays(file, arrays, _MEMBERS, sizes)
@@ -114,11 +109,8 @@ class HeadArrays:
     def __call__(
         self, pose: HeadPose, shape: FloatArray | None = None, static_offset: FloatArray | None = None
     ) -> FloatArray:
-        """Vertices (V, 3) in a pose, metres, float64.
-
-        ``shape``: (S,) identity coefficients; None for the mean head. ``static_offset``: (V, 3) metres, added to the shaped
-        template.
-        """
+        """Vertices (V, 3) in a pose, metres, float64. ``shape``: (S,) identity coefficients; None for the mean head.
+        ``static_offset``: (V, 3) metres, added to the shaped template."""
         from .model import PosedSubject  # with torch
 
         shape = np.zeros(self.shape_basis.shape[2]) if shape is None else shape
@@ -238,14 +230,14 @@ def with_derived_regions(head: HeadArrays) -> HeadArrays:
     Regions are derived only if all inputs exist and they are not given already; those that VHAP defines as vertex
     lists (irises, lip rings, ...) cannot be derived.
     """
-    known = dict(head.regions)
+    regions = dict(head.regions)
 
     def add(name: str, inputs: tuple[str, ...], members: IntArray) -> None:
-        if name not in known and all(source in known for source in inputs):
-            known[name] = np.unique(members)
+        if name not in regions and all(source in regions for source in inputs):
+            regions[name] = np.unique(members)
 
     def union(*names: str) -> IntArray:
-        return np.concatenate([np.empty(0, np.int64), *(known[name] for name in names if name in known)])
+        return np.concatenate([np.empty(0, np.int64), *(regions[name] for name in names if name in regions)])
 
     for name, parts in (
         ("ears", ("left_ear", "right_ear")),
@@ -257,7 +249,7 @@ def with_derived_regions(head: HeadArrays) -> HeadArrays:
     add("hair", ("scalp", "face", "neck"), np.setdiff1d(union("scalp"), union("face", "neck")))
     bare = union("eyeballs", "hair", "lips", "teeth", "boundary")
     add("skin", ("eyeballs", "hair", "lips"), np.setdiff1d(np.arange(len(head.template)), bare))
-    return replace(head, regions=known)
+    return replace(head, regions=regions)
 
 
 def region(head: HeadAsset, name: str) -> IntArray:

@@ -1,8 +1,15 @@
-"""Geometry of points and triangle meshes in numpy."""
+"""Geometry of points and triangle meshes in numpy.
+
+Rounding to a grid of powers of two, so that all x86-64 machines give the same values. The last digits of exp, sin,
+decompositions and long sums depend on instruction set, BLAS and threads. Values of a synthetic capture are rounded when
+computed, at least a thousand times coarser than those digits; products and sums of such numbers within the 53 bits of a
+float64 are then exact in any order.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...bench.contracts import Camera, FloatArray, IntArray
 
@@ -42,10 +49,8 @@ def mesh_edges(faces: IntArray) -> IntArray:
 
 
 def unique_pairs(pairs: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Unique rows of an (n, 2) array of indices, sorted, (m, 2); inverse indices (n,); counts (m,).
-
-    Ten times faster than `numpy.unique` along an axis because pairs are compared as single numbers.
-    """
+    """Unique rows of an (n, 2) array of indices, sorted, (m, 2); inverse indices (n,); counts (m,). Ten times faster
+    than `numpy.unique` along an axis because pairs are compared as single numbers."""
     base = int(pairs.max(initial=0)) + 1
     codes, inverse, count = np.unique(
         pairs[:, 0].astype(np.int64) * base + pairs[:, 1], return_inverse=True, return_counts=True
@@ -78,11 +83,8 @@ def vertex_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
 
 
 def even_weights(points: FloatArray, target: FloatArray) -> FloatArray:
-    """(n,) weights of points (n, 3) that sum to 1 and reproduce the target, as even as possible.
-
-    The target then moves with the points in every translation, rotation and scaling. Raises `ValueError` if the points
-    do not span it.
-    """
+    """(n,) weights of points (n, 3) that sum to 1 and reproduce the target, as even as possible. The target then moves
+    with the points in every translation, rotation and scaling. Raises `ValueError` if the points do not span it."""
     constraints = np.vstack([points.T, np.ones(len(points))])
     even = np.full(len(points), 1 / len(points))
     wanted = np.array([*target, 1.0])
@@ -106,6 +108,18 @@ def project(points: FloatArray, camera: Camera) -> FloatArray:
     seen = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     pixels: FloatArray = (seen @ camera.K.T)[:, :2] / np.maximum(seen[:, 2:], 1e-6)
     return pixels
+
+
+def project_facing(
+    points: FloatArray, normals: FloatArray, camera: Camera, cosine: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """(n, 2) pixels of points (n, 3), and (n,) whether each lies in the image with its normal within an angle of that
+    ``cosine`` to the camera."""
+    outward = camera.center - points
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    pixels = project(points, camera)
+    within = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    return pixels, ((normals * outward).sum(axis=1) > cosine) & within
 
 
 def rigid_alignment(points: FloatArray, wanted: FloatArray, weights: FloatArray | None = None) -> FloatArray:

@@ -310,11 +310,8 @@ def mesh_parts(
     materials: Mapping[str, IntArray],
     jaw_open: FloatArray,
 ) -> Parts:
-    """Split the mesh: sorted vertex indices by part.
-
-    ``materials``: Vertices of each material's triangles. ``jaw_open``: (V, 3) displacement of ``jawOpen``, which separates
-    lower teeth from upper teeth.
-    """
+    """Split the mesh: sorted vertex indices by part. ``materials``: Vertices of each material's triangles.
+    ``jaw_open``: (V, 3) displacement of ``jawOpen``, which separates lower teeth from upper teeth."""
     for name in _MATERIALS:
         if name not in materials or not len(materials[name]):
             raise InputError(file, "material_names", f"triangles of {name}", ", ".join(sorted(materials)))
@@ -443,11 +440,8 @@ class Hinge(NamedTuple):
 
 
 def fit_hinge(points: FloatArray, moved: FloatArray) -> Hinge:
-    """Least-squares hinge that takes points to moved points, both (n, 3).
-
-    Planar case of the orthogonal Procrustes problem (Schoenemann 1966); the centre is the fixed point of the
-    fitted rigid motion of the y-z plane.
-    """
+    """Least-squares hinge that takes points to moved points, both (n, 3). Planar case of the orthogonal Procrustes
+    problem (Schoenemann 1966); the centre is the fixed point of the fitted rigid motion of the y-z plane."""
     plane, target = points[:, 1:], moved[:, 1:]
     middle, target_middle = plane.mean(0), target.mean(0)
     a, b = plane - middle, target - target_middle

@@ -136,8 +136,8 @@ def load_head(
     else:
         head = _flame(path, version)
         masks = masks or _beside(path, MASKS_FILE)
-        own = path.with_name(REGIONS_FILE)  # a common file name
-        regions = regions or (own if own.is_file() else None)
+        regions_file = path.with_name(REGIONS_FILE)  # a common file name
+        regions = regions or (regions_file if regions_file.is_file() else None)
         lid = next(filter(None, (_beside(path, name) for name in EYELID_FILES)), None)
         eyelids = eyelids or (lid.parent if lid else None)
         chart = chart or next(filter(None, (_beside(path, name) for name in CHART_FILES)), None)

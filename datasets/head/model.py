@@ -2,6 +2,13 @@
 
 Li et al., "Learning a model of facial shape and expression from 4D scans", SIGGRAPH Asia 2017, section 4;
 the formulation of the skinning is that of SMPL (Loper et al., SIGGRAPH Asia 2015, section 3).
+
+A head with one identity: its neutral mesh, and its meshes and rigid motions over poses. A tracker of single videos
+keeps the head still and lets the camera move around it. With M the rigid motion of the head (global rotation about the
+root joint, neck rotation about the neck joint, translation) a camera W in the world becomes W M in the head's frame,
+and the pose keeps only expression, jaw, eyes and eyelids. Projections of vertices that follow the neck joint are
+unchanged except for the neck's pose correctives; vertices that follow the root (lower neck, shoulders) move with the
+head, as in such methods.
 """
 
 from __future__ import annotations
@@ -169,11 +176,8 @@ class HeadModel(torch.nn.Module):
         translation: Tensor,
         static_offset: Tensor | None = None,
     ) -> Tensor:
-        """Rigid motion of the head, (B, 4, 4): translation after the root's and the neck's rotation.
-
-        This is the head pose of trackers: it moves vertices that follow only the neck joint, apart from the neck's
-        pose correctives.
-        """
+        """Rigid motion of the head, (B, 4, 4): translation after the root's and the neck's rotation. This is the head
+        pose of trackers: it moves vertices that follow only the neck joint, apart from the neck's pose correctives."""
         joints = self.joints(shape, expression, static_offset)
         still = torch.zeros_like(_rows(rotation, 3, "rotation"))
         angles = self.angles(rotation, neck, still, torch.cat([still, still], dim=-1))
@@ -185,10 +189,8 @@ class HeadModel(torch.nn.Module):
         return torch.cat([torch.cat([turn.expand(batch, 3, 3), shift[..., None]], dim=-1), last], dim=-2)
 
     def pose_arguments(self, poses: Sequence[HeadPose]) -> dict[str, Tensor]:
-        """Poses as arguments of `forward`, with this model's dtype and device.
-
-        ``eyelids`` is included only if the model has eyelid bases (zeros for poses without them).
-        """
+        """Poses as arguments of `forward`, with this model's dtype and device. ``eyelids`` is included only if the
+        model has eyelid bases (zeros for poses without them)."""
         columns = self.pose_columns(poses)
         # One array, so that one copy takes it to a device.
         joined = torch.from_numpy(np.concatenate([*columns.values()], axis=1)).to(self.template.dtype)
@@ -291,10 +293,7 @@ BATCH = 64
 
 
 class PosedSubject:
-    """One identity of a head model.
-
-    ``shape``: (S,) identity coefficients. ``static_offset``: (V, 3) metres.
-    """
+    """One identity of a head model. ``shape``: (S,) identity coefficients. ``static_offset``: (V, 3) metres."""
 
     def __init__(
         self,

@@ -42,10 +42,8 @@ def skew(vector: Tensor) -> Tensor:
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
-    """Rotation matrices of axis-angle vectors (Rodrigues' formula). (..., 3) to (..., 3, 3).
-
-    R = I + sin(t)/t K + (1 - cos t)/t^2 K^2 with K = skew(v), t = |v|.
-    """
+    """Rotation matrices of axis-angle vectors (Rodrigues' formula). (..., 3) to (..., 3, 3). R = I + sin(t)/t K + (1 -
+    cos t)/t^2 K^2 with K = skew(v), t = |v|."""
     squared = axis_angle.square().sum(-1)[..., None, None]
     cross = skew(axis_angle)
     identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
@@ -53,10 +51,8 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 
 
 def rotation_of(axis_angle: FloatArray) -> Rotation:
-    """SciPy's rotation of axis-angle vectors, (3,) or (N, 3).
-
-    Vectors are copied because SciPy refuses read-only float64 arrays, which is what methods receive.
-    """
+    """SciPy's rotation of axis-angle vectors, (3,) or (N, 3). Vectors are copied because SciPy refuses read-only
+    float64 arrays, which is what methods receive."""
     return Rotation.from_rotvec(np.array(axis_angle, np.float64))
 
 
@@ -68,10 +64,8 @@ def axis_angle_to_quaternion(axis_angle: Tensor) -> Tensor:
 
 
 def quaternion_to_axis_angle(quaternion: Tensor) -> Tensor:
-    """Axis-angle vectors of length at most pi. (..., 4) to (..., 3); the input need not be of unit length.
-
-    At exactly pi both signs of the axis are valid; the one with the given imaginary part is returned.
-    """
+    """Axis-angle vectors of length at most pi. (..., 4) to (..., 3); the input need not be of unit length. At exactly
+    pi both signs of the axis are valid; the one with the given imaginary part is returned."""
     unit = normalize(quaternion, dim=-1)
     unit = torch.where(unit[..., :1] < 0, -unit, unit)
     real, imaginary = unit[..., :1], unit[..., 1:]

@@ -104,10 +104,8 @@ def _positions(upper: FloatArray, lower: FloatArray) -> FloatArray:
 
 
 def _triangles(columns: int, towards_left: bool) -> IntArray:
-    """Triangles of the six strips, seen from outside counter-clockwise, as indices into the new vertices.
-
-    In the order of GaussianAvatars, whose splats are bound to triangles by index and rotate with their first edge.
-    """
+    """Triangles of the six strips, seen from outside counter-clockwise, as indices into the new vertices. In the order
+    of GaussianAvatars, whose splats are bound to triangles by index and rotate with their first edge."""
     block = {name: index * columns + np.arange(columns) for index, name in enumerate(ROWS)}
     strips = []
     for first, second, falling, turned in (
@@ -224,8 +222,8 @@ def _arc(asset: HeadAsset, edges: IntArray, ring: np.ndarray, place: int) -> Int
 def _pieces(edges: IntArray, members: IntArray, vertices: int) -> list[IntArray]:
     """Connected pieces of a part of the mesh, as vertices."""
     inside = np.isin(np.arange(vertices), members)
-    own = edges[inside[edges].all(axis=1)]
-    graph = coo_matrix((np.ones(len(own)), own.T), shape=(vertices, vertices))
+    inner = edges[inside[edges].all(axis=1)]
+    graph = coo_matrix((np.ones(len(inner)), inner.T), shape=(vertices, vertices))
     labels = connected_components(graph, directed=False)[1][members]
     return [members[labels == label] for label in np.unique(labels)]
 

@@ -1,33 +1,100 @@
-"""The figure of a capture: camera rig, splits, tracked mesh on images, motion."""
+"""The figure of a capture: camera rig, splits, tracked mesh on images, motion.
+
+Overlays of the tracked mesh on images, for visual inspection of the tracking. Heat map of a refit: the subject's
+neutral head, coloured by mean residual.
+
+Matplotlib figures without a window, in one style for all commands on captures.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 import cv2
+import matplotlib
 import numpy as np
+from matplotlib import style
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.figure import SubFigure
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from ...bench.contracts import ByteArray, Camera, FloatArray, FrameKey, IntArray, Progress, no_progress
-from ...bench.io.figures import pixels
+from ...bench.io.figures import drawable, pixels
 from ...bench.protocol import evenly_with_ends
 from ..clip import CaptureClip
-from ..figures import HELD_OUT, MUTED, TRAIN, bands, hexadecimal, new_figure, shortened, show
 from ..head.geometry import rigid_alignment
 from ..head.model import PosedSubject
-from ..mesh_pictures import draw_mesh, rasterize_mesh
+from ..head.refit.refit import Refitted
+from ..mesh_pictures import CLAY, draw_mesh, portrait_camera, rasterize_mesh
 from .statistics import KEPT_VARIANCE, ExpressionSpace, SequenceRow, SplitRow
+
+Colour = tuple[int, int, int]
+
+TRAIN, HELD_OUT = "#0072b2", "#d55e00"
+"""Two of Okabe and Ito's colours, distinguishable with any colour vision."""
+MUTED, RULE, LEAK = "#737373", "#d6d6d6", "#be1e2d"
+DPI = 100
+
+_STYLE: Any = {
+    "text.parse_math": False,  # names may have dollar signs
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "axes.edgecolor": RULE,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.labelsize": 9,
+    "axes.axisbelow": True,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "grid.color": RULE,
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+}
+
+
+@contextmanager
+def new_figure(width: float, height: float) -> Iterator[Figure]:
+    """An empty figure of a size in inches; drawing and rasterising must happen within the context."""
+    with style.context(["default", _STYLE]):  # independent of the user's matplotlibrc, such as text.usetex
+        yield Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+
+
+def bands(figure: Figure, heights: Sequence[float]) -> list[SubFigure]:
+    """Vertically stacked parts of a figure with proportional heights."""
+    return list(np.asarray(figure.subfigures(len(heights), 1, height_ratios=heights)))
+
+
+def show(axes: Axes, image: ByteArray, *, frame: bool = False) -> None:
+    """Show an image on new axes without ticks."""
+    axes.imshow(image)
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(frame)
+
+
+def shortened(text: str, length: int) -> str:
+    """The text as it is drawn, shortened with an ellipsis to a number of characters."""
+    text = drawable(text)
+    return text if len(text) <= length else f"{text[: length - 1]}…"
+
+
+def hexadecimal(colour: str) -> Colour:
+    """Levels of a colour such as `TRAIN`."""
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+    return red, green, blue
 
 
 def draw_overlay(clip: CaptureClip, timesteps: Sequence[int], cameras: Sequence[str]) -> ByteArray:
-    """Images of some timesteps (rows) and cameras, and beside each one the mesh over it.
-
-    Returns (H, W, 3) 8-bit sRGB. Images of another size than the first are left out.
-    """
+    """Images of some timesteps (rows) and cameras, and beside each one the mesh over it. Returns (H, W, 3) 8-bit sRGB.
+    Images of another size than the first are left out."""
     subject, rows = PosedSubject.of(clip), []
     height, width = clip.image(clip.frame_at[timesteps[0], cameras[0]]).shape[:2]
     for timestep, mesh in subject.each(clip, timesteps):
@@ -118,9 +185,9 @@ def _draw_rigs(figure: SubFigure, clip: CaptureClip, splits: Sequence[SplitRow])
     ]
     labels = ["", "images", "timesteps", "cameras", "sequences"]
     widths = [0.3, 0.16, 0.19, 0.16, 0.19]
-    shown = table.table(cells, colLabels=labels, colWidths=widths, loc="upper left", edges="B")
-    shown.auto_set_font_size(False)
-    for (row, _), cell in shown.get_celld().items():
+    drawn = table.table(cells, colLabels=labels, colWidths=widths, loc="upper left", edges="B")
+    drawn.auto_set_font_size(False)
+    for (row, _), cell in drawn.get_celld().items():
         cell.set_edgecolor("white")
         if row and splits[row - 1].split != "excluded":
             cell.set_text_props(color=TRAIN if splits[row - 1].split == "train" else HELD_OUT)
@@ -211,8 +278,8 @@ def _head_picture(head: FloatArray, faces: IntArray) -> ByteArray:
     away = np.eye(4)
     away[2, 3] = _FAR_M
     camera = Camera("panel", width, height, intrinsics, away)
-    shown = rasterize_mesh(head, faces, camera).face >= 0
-    return np.dstack([draw_mesh(head, faces, camera), np.where(shown, 255, 0).astype(np.uint8)])
+    covered = rasterize_mesh(head, faces, camera).face >= 0
+    return np.dstack([draw_mesh(head, faces, camera), np.where(covered, 255, 0).astype(np.uint8)])
 
 
 def _short_names(names: list[str]) -> dict[str, str]:
@@ -369,8 +436,8 @@ def _draw_motion(
 
 def _draw_sequences(jaw: Axes, reach: Axes, rows: Sequence[SequenceRow]) -> None:
     """Ranges of each sequence as bars from minimum to maximum, with a mark at the median."""
-    shown = rows if len(rows) <= MAX_SEQUENCES else rows[: MAX_SEQUENCES - 1]
-    for place, row in enumerate(shown):
+    visible = rows if len(rows) <= MAX_SEQUENCES else rows[: MAX_SEQUENCES - 1]
+    for place, row in enumerate(visible):
         colour = HELD_OUT if row.held_out else TRAIN
         for axes, (low, typical, high) in ((jaw, row.jaw_deg), (reach, (0.0, *row.reach_mm))):
             axes.barh(place, high - low, left=low, height=0.5, color=colour, alpha=0.5)
@@ -381,18 +448,18 @@ def _draw_sequences(jaw: Axes, reach: Axes, rows: Sequence[SequenceRow]) -> None
     labels = [
         f"{shortened(row.sequence, 24)}, {row.timesteps}"
         + (f" (+{row.excluded} excl.)" if row.excluded else "")
-        for row in shown
+        for row in visible
     ]
-    jaw.set_yticks(range(len(shown)), labels)
-    for text, row in zip(jaw.get_yticklabels(), shown):
+    jaw.set_yticks(range(len(visible)), labels)
+    for text, row in zip(jaw.get_yticklabels(), visible):
         text.set_color(HELD_OUT if row.held_out else TRAIN)
     reach.set_yticks([])
     for axes, label in ((jaw, "jaw, degrees"), (reach, "expression, mm")):
-        axes.set_ylim(max(len(shown), 4) - 0.4, -0.6)
+        axes.set_ylim(max(len(visible), 4) - 0.4, -0.6)
         axes.set_xlim(left=0)
         axes.set_xlabel(label)
         axes.grid(axis="x")
-    more = f" (and {len(rows) - len(shown)} more)" if len(shown) < len(rows) else ""
+    more = f" (and {len(rows) - len(visible)} more)" if len(visible) < len(rows) else ""
     jaw.set_title(f"motion by sequence, timesteps{more}")
     reach.set_title("head, most", loc="right", fontsize=9, color=MUTED)
 
@@ -407,3 +474,33 @@ def space_summary(space: ExpressionSpace) -> str:
             f"test faces lie {np.median(new):.2f} mm (median; most {new.max():.2f}) from the nearest of them"
         )
     return "; ".join(parts)
+
+
+_YAWS = (-0.75, 0.0, 0.75)
+_VIEW = (560, 720)
+_SHOWN = 99  # percentile of the residuals at the upper end of the scale
+
+
+def draw_heat_map(refitted: Refitted) -> ByteArray:
+    """(H, W, 3) image of the head from three sides with a scale; vertices that were not fitted are grey."""
+    clip, report = refitted.clip, refitted.report
+    neutral = PosedSubject.of(clip).neutral
+    fitted = np.isfinite(report.vertex_mm)
+    top = max(float(np.percentile(report.vertex_mm[fitted], _SHOWN)), 1e-3)
+    colours = np.tile(np.array(CLAY), (len(neutral), 1))
+    colours[fitted] = matplotlib.colormaps["viridis"](np.clip(report.vertex_mm[fitted] / top, 0, 1))[:, :3]
+    summary = report.summary()
+    with new_figure(8.8, 5) as figure:
+        figure.suptitle(
+            f"Refit of {clip.subject}: {summary['source']} to {summary['target']}\n"
+            f"mean over {summary['timesteps']} timesteps; face: mean {summary['mean_mm']:.3f} mm, "
+            f"95th percentile {summary['p95_mm']:.3f} mm"
+        )
+        grid = figure.subplots(1, len(_YAWS))
+        for axes, yaw in zip(grid, _YAWS):
+            camera = portrait_camera(neutral, *_VIEW, yaw=yaw)
+            picture = draw_mesh(neutral, clip.head.faces, camera, colours, shading=0.35, supersampling=1)
+            show(axes, picture)
+        scale = ScalarMappable(Normalize(0, top), "viridis")
+        figure.colorbar(scale, ax=grid, location="bottom", shrink=0.5, aspect=40, label="mm")
+        return pixels(figure)

@@ -1,4 +1,7 @@
-"""Statistics of a capture: content of the splits and motion of the face in each sequence."""
+"""Statistics of a capture: content of the splits and motion of the face in each sequence.
+
+Novelty of test expressions relative to those of training.
+"""
 
 from __future__ import annotations
 
@@ -41,10 +44,8 @@ def displacement_metric(basis: FloatArray) -> FloatArray:
 
 
 def novelty(train: FloatArray, test: FloatArray, span: float = SPAN_VARIANCE) -> Novelty:
-    """Compare faces, (T, E) and (N, E) as `displacement_metric` gives them; at least one of each.
-
-    ``span`` is the fraction of the training variance in the span of training.
-    """
+    """Compare faces, (T, E) and (N, E) as `displacement_metric` gives them; at least one of each. ``span`` is the
+    fraction of the training variance in the span of training."""
     mean = train.mean(axis=0)
     _, singular, axes = np.linalg.svd(train - mean, full_matrices=False)
     variance = singular**2

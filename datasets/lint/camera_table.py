@@ -21,7 +21,7 @@ from ...bench.contracts import Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.protocol import evenly_with_ends
 from ..ga.transforms import FrameEntry
-from ..head.geometry import project, vertex_normals
+from ..head.geometry import project, project_facing, vertex_normals
 from .capture import Capture, TrackedSubject
 from .views import BLANK_LEVELS, structure
 
@@ -167,10 +167,8 @@ def _doubted(facts: Mapping[str, CameraFacts]) -> list[str]:
 
 
 def _pick_timesteps(capture: Capture, entries: Sequence[FrameEntry], count: int) -> dict[int, list[int]]:
-    """Timesteps to measure and, for each lag from -`MAX_LAG` to `MAX_LAG`, the timesteps of the poses.
-
-    From each of ``count`` equal parts of the capture, the timestep with the fastest head motion is selected.
-    """
+    """Timesteps to measure and, for each lag from -`MAX_LAG` to `MAX_LAG`, the timesteps of the poses. From each of
+    ``count`` equal parts of the capture, the timestep with the fastest head motion is selected."""
     sequences: dict[str, set[int]] = defaultdict(set)
     for entry in entries:
         sequences[entry.sequence_folder].add(entry.timestep)
@@ -262,13 +260,8 @@ class _Table:
     def pick(self, shot: _Shot, timestep: int, camera: Camera | None = None) -> _Picked:
         """Projection of the vertices into an image by the calibration of this or another camera."""
         camera = camera or shot.camera
-        points = self.points[timestep]
-        towards = camera.center - points
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        pixels = project(points, camera)
-        within = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
-        facing = (self.normals[timestep] * towards).sum(axis=1) > FACING
-        return _Picked(pixels, facing & within, shot.smooth)
+        pixels, seen = project_facing(self.points[timestep], self.normals[timestep], camera, FACING)
+        return _Picked(pixels, seen, shot.smooth)
 
     def _details(self, camera: str, offsets: Mapping[int, FloatArray | float]) -> FloatArray:
         """(F,) squared contrast of fine details in a camera, at offsets in pixels by timestep."""

@@ -168,10 +168,8 @@ class Capture:
         *,
         before_run: bool = False,
     ) -> Self:
-        """A capture of any reader from its clip, without the layout's files.
-
-        With ``before_run``, what the reader of the GaussianAvatars/VHAP layout recorded is used as well.
-        """
+        """A capture of any reader from its clip, without the layout's files. With ``before_run``, what the reader of
+        the GaussianAvatars/VHAP layout recorded is used as well."""
         steps = [step.parameters for step in clip.steps if before_run and step.name == "read_capture"]
         requested = settings.cy if settings.cy != "auto" else None
         convention: layout.CyConvention | None = steps[0]["cy"] if steps else requested

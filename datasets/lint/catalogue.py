@@ -1,4 +1,7 @@
-"""All rules of the linter, in order of their codes."""
+"""All rules of the linter, in order of their codes.
+
+The linter's errors that are checked before a run: those that change results and that no reader refuses.
+"""
 
 from __future__ import annotations
 

@@ -215,10 +215,8 @@ def _focal(evidence: Evidence) -> Iterator[Hit]:
 
 
 def principal_offsets(evidence: Evidence) -> dict[str, FloatArray]:
-    """(2,) pixels from the image's centre to the stated principal point, by camera; cameras that state one.
-
-    The vertical offset is as stated: if cy is measured from the bottom, positive is up.
-    """
+    """(2,) pixels from the image's centre to the stated principal point, by camera; cameras that state one. The
+    vertical offset is as stated: if cy is measured from the bottom, positive is up."""
     offsets: dict[str, FloatArray] = {}
     for camera, entry in first_entries(evidence).items():
         size = _size(evidence, entry)

@@ -15,7 +15,7 @@ from ...bench.contracts import ByteArray, Camera, FloatArray
 from ...bench.errors import InputError
 from ...bench.protocol import evenly_with_ends
 from ..ga.transforms import FrameEntry
-from ..head.geometry import project, vertex_normals
+from ..head.geometry import project_facing, vertex_normals
 from .camera_table import CameraFacts, measure_cameras
 from .capture import Capture, TrackedSubject
 from .views import Thumbnail, ViewFacts, facing_camera, inspect_views, make_thumbnails, pick_views
@@ -98,16 +98,12 @@ def weigh_expression(capture: Capture, camera: str | None) -> ExpressionFit | No
 def _face_colours(
     vertices: FloatArray, subject: TrackedSubject, camera: Camera, image: ByteArray
 ) -> _FaceColours:
-    points = vertices[subject.skin]
-    outward = vertex_normals(vertices, subject.head.faces)[subject.skin]
-    towards = camera.center - points
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    pixels = project(points, camera)
+    skin = subject.skin
+    normals = vertex_normals(vertices, subject.head.faces)[skin]
+    pixels, seen = project_facing(vertices[skin], normals, camera, FACING)
     where = (pixels - 0.5).astype(np.float32)  # OpenCV's pixel centres are at integers
     sampled = cv2.remap(image.astype(np.float32), where[:, :1], where[:, 1:], cv2.INTER_LINEAR)
-    colours = sampled[:, 0].astype(np.float64)
-    within = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
-    return _FaceColours(colours, ((outward * towards).sum(axis=1) > FACING) & within, pixels)
+    return _FaceColours(sampled[:, 0].astype(np.float64), seen, pixels)
 
 
 def _compare(

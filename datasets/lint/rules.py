@@ -80,10 +80,8 @@ def rule(
 def apply(
     rules: Sequence[Rule], evidence: Evidence, ignore: Collection[str] = (), *, base: Path | None = None
 ) -> list[Finding]:
-    """Run the rules over the evidence; findings in order of severity, then code.
-
-    Paths below ``base`` are reported relative to it.
-    """
+    """Run the rules over the evidence; findings in order of severity, then code. Paths below ``base`` are reported
+    relative to it."""
     findings = [
         Finding(rule.code, rule.severity, hit.message, rule.remedy, _relative(hit.file, base), hit.key)
         for rule in rules

@@ -1,4 +1,9 @@
-"""Clips of tracked videos: one camera, splits by the held-out frames, masks composited."""
+"""Clips of tracked videos: one camera, splits by the held-out frames, masks composited.
+
+Common representation of tracked videos: frames with a camera and a pose each. In these layouts the head is static, or
+nearly so, and every frame has its own camera. A clip has one camera and a moving head: `fix_camera` converts the former
+to the latter.
+"""
 
 from __future__ import annotations
 
@@ -125,16 +130,16 @@ def fix_camera(
     for index, (frame, root) in enumerate(zip(frames, roots)):
         motion = back @ frame.camera.world_to_camera if index else np.eye(4)
         turn = Rotation.from_matrix(motion[:3, :3])
-        own = frame.pose
+        pose = frame.pose
         poses[index] = HeadPose(
-            head_model=own.head_model,
-            expression=own.expression,
-            rotation=(turn * rotation_of(own.rotation)).as_rotvec(),
-            neck=own.neck,
-            jaw=own.jaw,
-            eyes=own.eyes,
-            translation=turn.apply(root + own.translation) + motion[:3, 3] - root,
-            eyelids=own.eyelids,
+            head_model=pose.head_model,
+            expression=pose.expression,
+            rotation=(turn * rotation_of(pose.rotation)).as_rotvec(),
+            neck=pose.neck,
+            jaw=pose.jaw,
+            eyes=pose.eyes,
+            translation=turn.apply(root + pose.translation) + motion[:3, 3] - root,
+            eyelids=pose.eyelids,
             subject=subject,
             timestep=index,
         )

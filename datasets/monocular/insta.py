@@ -59,12 +59,12 @@ def read_vertices(path: Path, count: int) -> FloatArray:
     """(V, 3) vertices of a Wavefront OBJ; faces are not read, since programs simplify them without changing the
     vertices."""
     content = read_bytes(path, "a Wavefront OBJ")
-    found = _VERTEX.findall(content)
-    if len(found) != count:
+    rows = _VERTEX.findall(content)
+    if len(rows) != count:
         remedy = "Give the head model the video was tracked with."
-        raise InputError(path, "v", f"{count} vertices, as the head model has", f"{len(found)}", remedy)
+        raise InputError(path, "v", f"{count} vertices, as the head model has", f"{len(rows)}", remedy)
     with reading(path, "three numbers for each vertex", "v"):  # no array of the longest word
-        vertices = np.array([[float(word) for word in vertex] for vertex in found])
+        vertices = np.array([[float(word) for word in vertex] for vertex in rows])
     check_numbers(path, "v", vertices, MAX_MAGNITUDE)
     return vertices
 
@@ -130,11 +130,8 @@ class MeshFit:
         return Identity(shape, turns, _middle(self._posed(shaped[None], turns[None])[0] - mesh))
 
     def fit_pose(self, mesh: FloatArray, shaped: FloatArray, known: FloatArray | None) -> Pose:
-        """Jaw, eyes and eyelids of one mesh.
-
-        ``mesh``: (V, 3). ``shaped``: (V, 3) head with identity and expression, unposed. ``known``: (9,) jaw and eyes if they
-        are known; only the eyelids are fitted then.
-        """
+        """Jaw, eyes and eyelids of one mesh. ``mesh``: (V, 3). ``shaped``: (V, 3) head with identity and expression,
+        unposed. ``known``: (9,) jaw and eyes if they are known; only the eyelids are fitted then."""
         turns, lids = np.zeros(9) if known is None else known, np.zeros(self._lids.shape[2])
         rows = self._rows
         by_lids = self._lids[rows].reshape(3 * len(rows), -1)
@@ -373,25 +370,25 @@ class _Meshes:
         )
         jaw = self._rotations(self._root / "flame/jaw" / f"{stem}.txt", 1)
         eyes = self._rotations(self._root / "flame/eyes" / f"{stem}.txt", 2)
-        known: FloatArray | None = None if jaw is None or eyes is None else np.concatenate([jaw, eyes])
+        angles: FloatArray | None = None if jaw is None or eyes is None else np.concatenate([jaw, eyes])
         lids: FloatArray | None = None
-        if known is None or head.eyelid_basis is not None or source.number in self._compared:
-            if known is not None and not source.mesh.is_file():
+        if angles is None or head.eyelid_basis is not None or source.number in self._compared:
+            if angles is not None and not source.mesh.is_file():
                 lids = None if head.eyelid_basis is None else np.zeros(2)
             else:
                 mesh = read_vertices(source.mesh, len(head.template))
                 self.files.add(source.mesh)
-                found = self._fit.fit_pose(mesh, self._neutral + self._expressions @ expression, known)
+                found = self._fit.fit_pose(mesh, self._neutral + self._expressions @ expression, angles)
                 check_distance(source.mesh, found.distance, head.version)
                 self._farthest, self._read = max(self._farthest, found.distance), self._read + 1
-                self._fitted += known is None
-                known = found.turns
+                self._fitted += angles is None
+                angles = found.turns
                 lids = found.lids if len(found.lids) else None
                 self._missed = max(self._missed, found.farthest)
                 self._closed = max(self._closed, float(found.lids.max(initial=0.0)))
-        assert known is not None, "fitted where it was not given"
+        assert angles is not None, "fitted where it was not given"
         rest = np.zeros(3)
-        return HeadPose(head.version, expression, rest, rest, known[:3], known[3:], rest, lids)
+        return HeadPose(head.version, expression, rest, rest, angles[:3], angles[3:], rest, lids)
 
     def notes(self) -> dict[str, Any]:
         """Source of the poses."""

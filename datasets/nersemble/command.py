@@ -49,13 +49,13 @@ def _check_named(settings: PrepareSettings, subjects: list[str]) -> None:
     """Raise `InputError` if no subject of a named group exists."""
     from .recording import participants
 
-    known = participants(Path(settings.root))
-    if settings.subjects not in SUBJECT_NAMES or set(subjects) & set(known):
+    by_id = participants(Path(settings.root))
+    if settings.subjects not in SUBJECT_NAMES or set(subjects) & set(by_id):
         return
-    remedy = f"Name those to prepare, as in --subjects {next(iter(known))}"
+    remedy = f"Name those to prepare, as in --subjects {next(iter(by_id))}"
     remedy += ': it defaults to "paper".' if settings.subjects == "paper" else "."
     expected = f'folders of "{settings.subjects}", which is {", ".join(subjects)}'
-    raise InputError(settings.root, "--subjects", expected, ", ".join(known), remedy)
+    raise InputError(settings.root, "--subjects", expected, ", ".join(by_id), remedy)
 
 
 def _table(plans: list[PreparationPlan]) -> list[str]:

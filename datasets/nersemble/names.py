@@ -3,6 +3,8 @@
 Sources: "3D Gaussian Head Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations"
 (CVPR 2025), section 4 and supplement, for the subjects and the split by FREE; VHAP's union export for the ten
 sequences and the rule that holds one of them out.
+
+Settings of the conversion of NeRSemble recordings.
 """
 
 from __future__ import annotations
@@ -132,11 +134,8 @@ def numbered(stem: str) -> tuple[str, int] | None:
 
 
 def match_sequence(file: str | PathLike[str], wanted: str, available: Iterable[str]) -> str:
-    """The available sequence with that name or unique prefix.
-
-    Prefixes that end before a hyphen are preferred: ``SEN-1`` is ``SEN-1-...`` and not ``SEN-10-...``. Raises
-    `InputError` if none or several fit.
-    """
+    """The available sequence with that name or unique prefix. Prefixes that end before a hyphen are preferred:
+    ``SEN-1`` is ``SEN-1-...`` and not ``SEN-10-...``. Raises `InputError` if none or several fit."""
     names = sorted(set(available))
     if wanted in names:
         return wanted
@@ -178,17 +177,13 @@ PAPER_SEQUENCES = (*UNION10_SEQUENCES, TEST_SEQUENCE)
 
 def union10_held_out(subject: str) -> str:
     """Held-out sequence of VHAP's union export of ten: drawn by Python's generator, seeded with the subject.
-
-    ``subject`` is the id as text, leading zeros included.
-    """
+    ``subject`` is the id as text, leading zeros included."""
     return UNION10_SEQUENCES[random.Random(subject).randint(0, len(UNION10_SEQUENCES) - 1)]
 
 
 def chosen_subjects(text: str) -> list[str]:
-    """Subject ids of an option: ids separated by commas, ``paper`` (the nine) or ``ablation``.
-
-    Numbers are padded to three digits, so 74 is 074.
-    """
+    """Subject ids of an option: ids separated by commas, ``paper`` (the nine) or ``ablation``. Numbers are padded to
+    three digits, so 74 is 074."""
     if text in SUBJECT_NAMES:
         return [*SUBJECT_NAMES[text]]
     ids = [part.strip() for part in text.split(",") if part.strip()]

@@ -24,8 +24,7 @@ from .names import (
     PrepareSettings,
     union10_held_out,
 )
-from .pixels import Correction
-from .recording import Participant, participant, read_calibration
+from .recording import Correction, Participant, participant, read_calibration
 from .sequence import RecordedSequence, read_sequence
 from .tracking import TrackedSequence, find_tracked, read_tracked
 
@@ -170,9 +169,9 @@ def _head_version(settings: PrepareSettings, head: HeadArrays | None) -> str:
             remedy = f"{settings.head} is FLAME 2023 Open: say so if the tracking was made with it, else give FLAME 2023."
             raise InputError("command line", "--head-model", repr(OPEN), "nothing", remedy)
         return head.version
-    known = (*_FLAME_VERSIONS, *VERSIONS)
-    if stated and stated not in known:
-        expected = f"one of {', '.join(known)}"
+    versions = (*_FLAME_VERSIONS, *VERSIONS)
+    if stated and stated not in versions:
+        expected = f"one of {', '.join(versions)}"
         remedy = "Give the file of another head model with --head."
         raise InputError("command line", "--head-model", expected, repr(stated), remedy)
     return stated or _USUAL_HEAD

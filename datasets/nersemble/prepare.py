@@ -33,8 +33,8 @@ from ..ga.writer import camera_record, file_record, save_npz, transforms_documen
 from ..head.arrays import save_head
 from ..images import is_whole, read_mask, write_image
 from .names import NOVEL_VIEW_CAMERA
-from .pixels import prepare_pixels, read_still
 from .plan import CY, PreparationPlan, SequenceJob
+from .recording import prepare_pixels, read_still
 from .sequence import RecordedView, open_video
 from .tracking import TrackedSequence
 
@@ -102,11 +102,8 @@ class _Stream:
 def write_images(
     jobs: Sequence[SequenceJob], *, workers: int = 0, progress: Progress = no_progress
 ) -> tuple[int, int]:
-    """Write missing images; return the numbers of written and existing images.
-
-    Complete existing images are kept. The first error stops all streams and is raised; what was written
-    stays, and another call continues with it.
-    """
+    """Write missing images; return the numbers of written and existing images. Complete existing images are kept. The
+    first error stops all streams and is raised; what was written stays, and another call continues with it."""
     streams = [_missing_frames(job, index) for job in jobs for index in range(len(job.cameras))]
     total = sum(job.count * len(job.cameras) for job in jobs)
     kept = total - sum(len(stream.timesteps) for stream in streams)
@@ -324,10 +321,8 @@ def _count_images(job: SequenceJob) -> int:
 
 
 def _write_metadata(plan: PreparationPlan, job: SequenceJob, state: SequenceState) -> None:
-    """Write a sequence's JSONs and parameters, unless they are there already.
-
-    A call without tracking leaves the parameters that an earlier call wrote.
-    """
+    """Write a sequence's JSONs and parameters, unless they are there already. A call without tracking leaves the
+    parameters that an earlier call wrote."""
     if job.tracked is None and (_is_readable(job) or (state.images_complete and state.metadata)):
         if not state.images_complete:
             _write_state(job, replace(state, images_complete=True))

@@ -179,7 +179,7 @@ def _image_views(
 
 def _numbered(folder: Path, serials: Sequence[str]) -> dict[str, dict[int, Path]]:
     """Files of VHAP's preprocessing, which omits the serial for a single camera."""
-    found: dict[str, dict[int, Path]] = {}
+    frames: dict[str, dict[int, Path]] = {}
     for path in entries(folder):
         parsed = numbered(path.stem) if path.suffix.lower() in _IMAGE_SUFFIXES else None
         if parsed is None:
@@ -188,8 +188,8 @@ def _numbered(folder: Path, serials: Sequence[str]) -> dict[str, dict[int, Path]
         if not serial:
             expected = "names with a serial, cam_SERIAL_000000, or one camera to give them to"
             raise InputError(path, "", expected, f"{len(serials)} cameras", "Name the camera they are of.")
-        found.setdefault(serial, {})[parsed[1]] = path
-    return found
+        frames.setdefault(serial, {})[parsed[1]] = path
+    return frames
 
 
 def _frame_folders(folder: Path) -> dict[str, RecordedView]:
@@ -246,10 +246,8 @@ def probe_video(path: Path) -> tuple[int, tuple[int, int]]:
 
 
 def open_video(path: Path) -> cv2.VideoCapture:
-    """Open a video on one decoding thread, since streams run in parallel.
-
-    Pixels are read as stored, without the rotation in the file's metadata.
-    """
+    """Open a video on one decoding thread, since streams run in parallel. Pixels are read as stored, without the
+    rotation in the file's metadata."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     if not capture.isOpened():

@@ -1,5 +1,8 @@
 """Tracked FLAME parameters of VHAP, found by subject and sequence, and validated.
 
+Check of unions exported elsewhere, and joining for the paper's split. GaussianAvatars' download holds, per subject, a
+``UNION10`` folder and its sequence folders, FREE among them; the union uses another test sequence.
+
 Formats read:
 
 - VHAP's `tracked_flame_params_*.npz`. Written by ShenhanQian/VHAP@4b64ab7d (`vhap/model/tracker.py`). Not checked on a file of the program.
@@ -57,10 +60,8 @@ class UnionReport:
 def check_unions(
     root: Path, subjects: Sequence[str], *, rejoin: bool = False, progress: Progress = no_progress
 ) -> CommandResult:
-    """Check the union of each subject under ``root``; with ``rejoin`` also write those of the paper's split.
-
-    Passes if every subject has one and all are complete.
-    """
+    """Check the union of each subject under ``root``; with ``rejoin`` also write those of the paper's split. Passes if
+    every subject has one and all are complete."""
     if not root.is_dir():
         raise InputError(root, "", "a folder of UNION folders", "a file" if root.exists() else "nothing")
     reports = []
@@ -149,10 +150,8 @@ _REJOINED = "_rejoined"
 
 
 def rejoin_union(root: Path, subject: str, entries: Sequence[FrameEntry], free: str) -> str:
-    """Write the union of the paper's split beside the others: all sequences of a union, and FREE as the test.
-
-    Returns the folder's name. Raises `InputError` if FREE does not exist.
-    """
+    """Write the union of the paper's split beside the others: all sequences of a union, and FREE as the test. Returns
+    the folder's name. Raises `InputError` if FREE does not exist."""
     if not free:
         expected = f"a sequence folder {subject}_{TEST_SEQUENCE}_..., exported with its parameters"
         raise InputError(root, subject, expected, "none")
@@ -211,11 +210,8 @@ class TrackedSequence:
 def read_tracked(
     path: Path, *, timesteps: int, head: HeadArrays | None = None, kept: Sequence[bool] = ()
 ) -> TrackedSequence:
-    """Read ``tracked_flame_params_*.npz`` and check it against the frames and, where given, the head model.
-
-    ``kept`` is whether each frame before a cut is among the ``timesteps``; parameters of all frames are cut
-    accordingly.
-    """
+    """Read ``tracked_flame_params_*.npz`` and check it against the frames and, where given, the head model. ``kept`` is
+    whether each frame before a cut is among the ``timesteps``; parameters of all frames are cut accordingly."""
     arrays = read_npz(path)
     if "rotation_matrices" in arrays:
         remedy = (

@@ -9,6 +9,12 @@ Both embeddings, of all pairs and of a few columns of the similarity matrix (Nys
 `SpectralClustering` with a precomputed affinity: leading eigenvectors of D^-1/2 (S - I) D^-1/2, each row divided by
 the square root of its degree. Von Luxburg, "A tutorial on spectral clustering", Statistics and Computing 2007;
 Fowlkes, Belongie, Chung and Malik, "Spectral grouping using the Nyström method", PAMI 2004.
+
+Jaw bases: a few jaw rotations that span those of a performance, and the weights of a pose on them. "3D Gaussian Head
+Avatars with Expressive Dynamic Appearances by Compact Tensorial Representations" (CVPR 2025, arXiv 2504.14967), section
+on feature lines. The paper's code selects the bases from validation and test poses and seeds them with a half turn;
+here they are selected only from training poses and seeded with the identity. The published behaviour is
+``variant="official"``.
 """
 
 from __future__ import annotations
@@ -180,9 +186,9 @@ def cluster_expressions(
         labels, embedding = cluster_by_distance(distances, classes, seed=seed, variant=variant)
         landmarks, radius = len(faces), 0.0
     else:
-        found = farthest_meshes(faces, limit, seed=seed, tolerance=LANDMARK_TOLERANCE, progress=progress)
-        labels, embedding = cluster_by_distance(found.distances, classes, found.indices)
-        landmarks, radius = len(found.indices), found.radius
+        chosen = farthest_meshes(faces, limit, seed=seed, tolerance=LANDMARK_TOLERANCE, progress=progress)
+        labels, embedding = cluster_by_distance(chosen.distances, classes, chosen.indices)
+        landmarks, radius = len(chosen.indices), chosen.radius
     medoids = timesteps[_medoids(labels, embedding)]
     return ExpressionClusters(timesteps, labels, medoids, landmarks, radius, variant)
 
@@ -227,12 +233,12 @@ def cluster_by_distance(
 
 def _medoids(labels: IntArray, embedding: FloatArray) -> IntArray:
     """(classes,) item of each class nearest to the mean of the class."""
-    found = []
+    rows = []
     for label in range(labels.max() + 1):
         members = np.flatnonzero(labels == label)
         points = embedding[members]
-        found.append(members[np.square(points - points.mean(axis=0)).sum(axis=1).argmin()])
-    return np.array(found)
+        rows.append(members[np.square(points - points.mean(axis=0)).sum(axis=1).argmin()])
+    return np.array(rows)
 
 
 FACE_REGION, EYE_REGION = "face", "eye_region"
@@ -254,11 +260,8 @@ class Landmarks(NamedTuple):
 
 
 def expression_displacements(clip: Clip, timesteps: Sequence[int]) -> FloatArray:
-    """(T, 3, F) float32 displacements of the face's F vertices from the neutral face, metres.
-
-    Meshes have jaw, eyes and expression, but no rotation, neck and translation; vertices of the eye region have weight
-    `EYE_WEIGHT`.
-    """
+    """(T, 3, F) float32 displacements of the face's F vertices from the neutral face, metres. Meshes have jaw, eyes and
+    expression, but no rotation, neck and translation; vertices of the eye region have weight `EYE_WEIGHT`."""
     vertices, weights = _face_vertices(clip.head)
     subject = PosedSubject.of(clip, torch.float32)
     poses = [pose_in_head_frame(clip.poses[timestep]) for timestep in timesteps]

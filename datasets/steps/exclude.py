@@ -42,10 +42,8 @@ def exclude_timesteps(
     *,
     source: str | PathLike[str] = "excluded frames",
 ) -> CaptureClip:
-    """Move the labelled timesteps of a clip from its splits to `excluded`, with their reasons.
-
-    ``reasons``: Label by timestep, such as {57: "tongue out"}. ``source``: Source of the reasons, named in the error.
-    """
+    """Move the labelled timesteps of a clip from its splits to `excluded`, with their reasons. ``reasons``: Label by
+    timestep, such as {57: "tongue out"}. ``source``: Source of the reasons, named in the error."""
     unknown = sorted(set(reasons) - set(clip.poses))
     if unknown:
         expected = f"timesteps of the clip, 0 to {max(clip.poses)}"
@@ -60,10 +58,8 @@ def exclude_timesteps(
 
 
 def exclude_given(clip: Clip, exclude: Mapping[int, str] | str | Path | None) -> CaptureClip:
-    """Exclude the timesteps of a reader's setting ``exclude`` from a clip of any reader.
-
-    ``exclude``: Reason by timestep, or a file for `read_reasons`, such as the one that ``headbench prepare tongue`` writes.
-    """
+    """Exclude the timesteps of a reader's setting ``exclude`` from a clip of any reader. ``exclude``: Reason by
+    timestep, or a file for `read_reasons`, such as the one that ``headbench prepare tongue`` writes."""
     from ..clip import as_capture  # slow to import
 
     clip = as_capture(clip)

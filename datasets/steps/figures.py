@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from ...bench.contracts import ByteArray, Clip, FloatArray, FrameKey, HeadPose, Progress, no_progress
 from ...bench.io.figures import pixels
 from ..clip import CaptureClip
-from ..figures import HELD_OUT, LEAK, MUTED, TRAIN, bands, new_figure, shortened, show
 from ..head.model import PosedSubject, pose_in_head_frame
 from ..head.rotations import rotation_of
+from ..inspect.figure import HELD_OUT, LEAK, MUTED, TRAIN, bands, new_figure, shortened, show
 from ..mesh_pictures import draw_mesh, portrait_camera
 from .clusters import DEFAULT_COUNT, ExpressionClusters, jaw_bases, jaw_quaternions, jaw_weights, leaks
 

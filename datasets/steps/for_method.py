@@ -1,6 +1,10 @@
 """Conversion of a clip to the requirements of a method, and of its renders back.
 
 Found by the harness as the entry point of `headbench.adaptation`, see `headbench.bench.engine.adaptation`.
+
+Resolution alignment: resizes a clip to a method's image size, and renders back to the protocol's size. Image
+coordinates are measured from the top left corner of the top left pixel, so that coordinates scale without an offset: x'
+= x * width' / width. Colours are resampled as stored (display-referred), as in other tools.
 """
 
 from __future__ import annotations
@@ -59,10 +63,8 @@ class Alignment:
 
     @classmethod
     def of(cls, source: Size, rule: ResolutionRule) -> Alignment:
-        """Apply a rule to an image size. Operations without effect are omitted.
-
-        A side that is not a multiple of the divisor is rounded down, which makes its pixels slightly larger.
-        """
+        """Apply a rule to an image size. Operations without effect are omitted. A side that is not a multiple of the
+        divisor is rounded down, which makes its pixels slightly larger."""
         moves: list[Resize | PixelBox] = []
         width, height = source
         if rule.square and width != height:
@@ -96,10 +98,8 @@ class Alignment:
         return camera
 
     def image(self, image: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
-        """Align a composited float32 image (H, W, 3) in [0, 1]; boxes are padded with ``background``.
-
-        Coverage is aligned the same way as (H, W, 1) on background 0.
-        """
+        """Align a composited float32 image (H, W, 3) in [0, 1]; boxes are padded with ``background``. Coverage is
+        aligned the same way as (H, W, 1) on background 0."""
         _check_size("image", self.source, (image.shape[1], image.shape[0]))
         for move in self.moves:
             if isinstance(move, Resize):
@@ -109,10 +109,8 @@ class Alignment:
         return image
 
     def restore(self, render: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
-        """Convert an (H, W, 3) render of the aligned view to the source's size, in one antialiased resizing.
-
-        Cropped parts become ``background``.
-        """
+        """Convert an (H, W, 3) render of the aligned view to the source's size, in one antialiased resizing. Cropped
+        parts become ``background``."""
         _check_size("render", self.aligned_size, (render.shape[1], render.shape[0]))
         boxes = [move for move in self.moves if isinstance(move, PixelBox)]
         box = boxes[0] if boxes else PixelBox(0, 0, *self.source)
@@ -282,7 +280,7 @@ def as_single_video(clip: CaptureClip) -> SingleVideo:
 
     This is how the paper gave multi-view captures to GaussianBlendshapes. Training frames come first and are
     numbered without a gap; frames of other splits have later numbers; they are not part of the video, but keep pose
-    and camera for rendering. The head's rigid motion moves into the cameras (see `head.subject`): every frame has its
+    and camera for rendering. The head's rigid motion moves into the cameras (see `head.model`): every frame has its
     own camera, named after the one that recorded it, and a pose without rotation, neck and translation.
     """
     order = _order(clip)

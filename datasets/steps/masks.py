@@ -158,9 +158,7 @@ def without_torso(
     clip: CaptureClip, cut: str, parsing: str, view: Callable[[ByteArray], ByteArray] | None = None
 ) -> CaptureClip:
     """The clip without clothes by the labels in the folder ``parsing``, else with the cut of the options of commands.
-
-    Frames without masks are not cut, since the room behind the person remains in them, too.
-    """
+    Frames without masks are not cut, since the room behind the person remains in them, too."""
     if not parsing:
         masked = all(clip.has_mask(key) for key in clip.files)
         return mask_below_neck(clip) if cut == "bust-line" and masked else clip
@@ -177,10 +175,8 @@ def label_files(clip: CaptureClip, parsing: str) -> dict[FrameKey, Path]:
 
 
 def neck_anchors(head: HeadAsset) -> IntArray:
-    """(4,) vertices: front, left and right of the neck's lower boundary, and the top of the head.
-
-    The boundary is the region of that name, else the lower half of the neck.
-    """
+    """(4,) vertices: front, left and right of the neck's lower boundary, and the top of the head. The boundary is the
+    region of that name, else the lower half of the neck."""
     x, y, z = np.asarray(head.template, np.float64).T
     if len(head.regions.get("boundary", ())):
         rim = np.asarray(head.regions["boundary"])
@@ -194,10 +190,8 @@ def neck_anchors(head: HeadAsset) -> IntArray:
 
 
 def neck_line(camera: Camera, anchors: FloatArray) -> NeckLine | None:
-    """The line in an image, given the (4, 3) world positions of `neck_anchors`; None where one is behind it.
-
-    Seen from the side, the left and right of the neck coincide; the line is then perpendicular to the head's height.
-    """
+    """The line in an image, given the (4, 3) world positions of `neck_anchors`; None where one is behind it. Seen from
+    the side, the left and right of the neck coincide; the line is then perpendicular to the head's height."""
     points = anchors @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     if points[:, 2].min() <= 0:
         return None

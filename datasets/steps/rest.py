@@ -1,4 +1,8 @@
-"""A rest expression other than zero, as of trackers whose coefficients at rest depend on the person."""
+"""A rest expression other than zero, as of trackers whose coefficients at rest depend on the person.
+
+A chart for head models without texture coordinates, for methods that place splats on a chart. Rotation of the neck
+moved into the rigid motion of the head, as trackers without a neck joint describe a head.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +20,8 @@ from ..head.model import PosedSubject
 
 
 def as_rigid_head(clip: Clip, config: RunConfig) -> CaptureClip:
-    """A clip whose poses have no rotation of the neck: root and translation make up the motion of the head.
-
-    Vertices that fully follow the neck do not move; those below it follow the head. Images are unchanged.
-    """
+    """A clip whose poses have no rotation of the neck: root and translation make up the motion of the head. Vertices
+    that fully follow the neck do not move; those below it follow the head. Images are unchanged."""
     source = as_capture(clip)
     subject = PosedSubject.of(source)
     poses = list(source.poses.values())

@@ -2,6 +2,8 @@
 
 Everything is measured on the subject's own neutral shape, so that any head with the named landmarks (or the
 68 of iBUG's scheme) can be rendered. Left is the subject's left, +x; +y is up and +z is front; metres.
+
+Distances to points, polylines and polygons, and noise, from which skin, hair and wrinkles are painted.
 """
 
 from __future__ import annotations
@@ -25,10 +27,8 @@ def blob(points: FloatArray, center: FloatArray, radius: float | FloatArray) -> 
 
 
 def polyline_distance(points: FloatArray, line: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance to a polyline and the arc-length position of the nearest point on it.
-
-    ``points`` (N, D), ``line`` (M, D) -> distances (N,) and arc-length shares (N,) in [0, 1].
-    """
+    """Distance to a polyline and the arc-length position of the nearest point on it. ``points`` (N, D), ``line`` (M, D)
+    -> distances (N,) and arc-length shares (N,) in [0, 1]."""
     best, place = np.full(len(points), np.inf), np.zeros(len(points))
     lengths = np.linalg.norm(np.diff(line, axis=0), axis=1)
     start = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -87,10 +87,8 @@ def value_noise(points: FloatArray, seed: int) -> FloatArray:
 
 
 def fractal_noise(points: FloatArray, period: float, seed: int, octaves: int = 4) -> FloatArray:
-    """Sum of octaves of value noise, each of half the period and amplitude; about [-1, 1].
-
-    ``period`` is the largest lattice spacing, in the unit of ``points``.
-    """
+    """Sum of octaves of value noise, each of half the period and amplitude; about [-1, 1]. ``period`` is the largest
+    lattice spacing, in the unit of ``points``."""
     total, amplitude, norm = np.zeros(len(points)), 1.0, 0.0
     for octave in range(octaves):
         total += amplitude * value_noise(points * (2.0**octave / period) + 17.3 * octave, seed + octave)
@@ -100,11 +98,8 @@ def fractal_noise(points: FloatArray, period: float, seed: int, octaves: int = 4
 
 
 def spots(points: FloatArray, spacing: float, radius: float, share: float, seed: int) -> FloatArray:
-    """Round spots scattered in space, (N,) in [0, 1]: 1 in a spot's middle.
-
-    One spot at most per cell of a lattice of ``spacing``, in a ``share`` of the cells, with radii of
-    ``radius`` times 0.5 to 1.5.
-    """
+    """Round spots scattered in space, (N,) in [0, 1]: 1 in a spot's middle. One spot at most per cell of a lattice of
+    ``spacing``, in a ``share`` of the cells, with radii of ``radius`` times 0.5 to 1.5."""
     base = np.floor(points / spacing).astype(np.int64)
     best = np.zeros(len(points))
     for offset in np.ndindex(3, 3, 3):
@@ -147,10 +142,8 @@ _REFERENCE_EYE_DISTANCE = 0.063  # adult interpupillary distance, metres
 
 @dataclass(frozen=True, eq=False)
 class Eye:
-    """One eye: its ball and the outline of its opening as seen from the front.
-
-    ``upper`` and ``lower`` are (n, 2) curves in x and y from the inner to the outer corner, at rest.
-    """
+    """One eye: its ball and the outline of its opening as seen from the front. ``upper`` and ``lower`` are (n, 2)
+    curves in x and y from the inner to the outer corner, at rest."""
 
     center: FloatArray
     radius: float
@@ -257,10 +250,8 @@ def _opening(
 def front_depth(
     vertices: FloatArray, faces: IntArray, low: FloatArray, step: float, size: IntArray
 ) -> FloatArray:
-    """Largest z of ``faces`` over a grid of x and y, (rows along y, columns along x); -inf where there is none.
-
-    Grid point (row, column) is at ``low + step * (column, row)``.
-    """
+    """Largest z of ``faces`` over a grid of x and y, (rows along y, columns along x); -inf where there is none. Grid
+    point (row, column) is at ``low + step * (column, row)``."""
     depth = np.full((size[1], size[0]), -np.inf)
     corner = vertices[faces]
     grid = (corner[..., :2] - low) / step

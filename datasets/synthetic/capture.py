@@ -3,7 +3,7 @@
 A folder belongs to one set of settings. Each image is written atomically and depends only on those settings, so a
 killed run continues and gives the same capture.
 
-Every file has the same bytes on every x86-64 machine, with any number of threads (see `rounding` and `panels`).
+Every file has the same bytes on every x86-64 machine, with any number of threads (see `head.geometry` and `panels`).
 """
 
 from __future__ import annotations
@@ -335,11 +335,13 @@ def _manifest(settings: SyntheticSettings, head: str) -> dict[str, Any]:
 def _check_pictures(pictures: Path, wanted: Mapping[str, Any]) -> None:
     """Refuse images whose settings differ in more than tracking."""
     manifest = pictures / MANIFEST
-    found = read_json(manifest)
+    manifest_data = read_json(manifest)
     tracking = {"tracking_error", "tracking_noise", "tracker"}
-    for key in {**wanted, **found}.keys() - tracking - {"head"}:  # the name of the head is irrelevant
-        if found.get(key) != wanted.get(key):
-            raise InputError(manifest, key, f"{wanted.get(key)!r}, as asked for", f"{found.get(key)!r}")
+    for key in {**wanted, **manifest_data}.keys() - tracking - {"head"}:  # the name of the head is irrelevant
+        if manifest_data.get(key) != wanted.get(key):
+            raise InputError(
+                manifest, key, f"{wanted.get(key)!r}, as asked for", f"{manifest_data.get(key)!r}"
+            )
 
 
 def _take_over(pictures: Path, out: Path, plans: Sequence[SubjectPlan]) -> None:
@@ -365,14 +367,14 @@ def _claim(out: Path, wanted: Mapping[str, Any]) -> None:
     """Mark the folder as belonging to the capture with settings ``wanted``; refuse the folder of another capture."""
     manifest, readme = out / MANIFEST, out / "README.txt"
     if manifest.exists():
-        found = read_json(manifest)
-        for key in {**wanted, **found}:
-            if found.get(key) != wanted.get(key):
+        manifest_data = read_json(manifest)
+        for key in {**wanted, **manifest_data}:
+            if manifest_data.get(key) != wanted.get(key):
                 expected, remedy = (
                     f"{wanted.get(key)!r}, as asked for",
                     "Give another folder, or the same settings.",
                 )
-                raise InputError(manifest, key, expected, f"{found.get(key)!r}", remedy)
+                raise InputError(manifest, key, expected, f"{manifest_data.get(key)!r}", remedy)
     else:
         if any(_is_foreign(path) for path in user_files(out)):
             raise InputError(out, "", "an empty folder or an earlier synthetic capture", "other files")

@@ -1,4 +1,7 @@
-"""``headbench synth``."""
+"""``headbench synth``.
+
+Requirements of the synthetic capture on the machine, for `DatasetSpec.needs`.
+"""
 
 from __future__ import annotations
 

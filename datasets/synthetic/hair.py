@@ -2,6 +2,10 @@
 
 The cap is the scalp itself pushed outwards, so that no skin shows between the locks and the mask stays
 whole; the locks give strands, shine and a soft outline. Both move with the head.
+
+Static offset of hair, beard and sagging skin, like that of a tracker with vertex offsets such as VHAP. VHAP fits one
+offset a vertex to all frames under a Laplacian penalty: the hair's volume without its locks. Here it is a part of the
+mean thickness of hair over the head model's own vertices, smoothed over its edges.
 """
 
 from __future__ import annotations
@@ -73,8 +77,8 @@ def hair_share(person: Person, anatomy: Anatomy, points: FloatArray, ears: Float
     line = anatomy["glabella"][1] + s * np.interp(azimuth, _AZIMUTH, _HEIGHT)
     line = line + person.recession * s * smoothstep(azimuth, 1.15, 0.6)
     ragged = 0.0035 * s * fractal_noise(points, 0.012 * s, person.seed + 80, 3)
-    grown = smoothstep(points[:, 1] - line + ragged, -0.002 * s, 0.016 * s)
-    return grown * (1.0 - ears) * (1.0 - _around_lobes(points, ears, s))
+    density = smoothstep(points[:, 1] - line + ragged, -0.002 * s, 0.016 * s)
+    return density * (1.0 - ears) * (1.0 - _around_lobes(points, ears, s))
 
 
 def _around_lobes(points: FloatArray, ears: FloatArray, s: float) -> FloatArray:
@@ -200,8 +204,8 @@ def _sample(
     """Draw triangles by area where hair grows, most densely at its edge, which no locks from elsewhere cover."""
     corner = points[faces]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-    grown = share[faces].mean(axis=1)
-    chance = area * np.where(grown > _COLOURED, 3.0 - 2.0 * grown, 0.0)
+    density = share[faces].mean(axis=1)
+    chance = area * np.where(density > _COLOURED, 3.0 - 2.0 * density, 0.0)
     return rng.choice(len(faces), count, p=chance / chance.sum())
 
 
@@ -235,10 +239,8 @@ def grow(
     keep_out: Callable[[FloatArray, float], FloatArray],
     segments: int,
 ) -> FloatArray:
-    """Polylines (n, segments + 1, 3) from ``roots`` along ``field``, each of its own length.
-
-    ``keep_out(points, share)`` moves points inside the head out of it.
-    """
+    """Polylines (n, segments + 1, 3) from ``roots`` along ``field``, each of its own length. ``keep_out(points,
+    share)`` moves points inside the head out of it."""
     path = [roots]
     step = (lengths / segments)[:, None]
     for index in range(segments):

@@ -2,6 +2,11 @@
 
 A state is a function of the exact controls of a sequence up to a timestep, starting at rest. Tracked parameters alone
 do not determine it.
+
+Hair and the skin of the neck follow the head late, which tracked parameters do not show. Each follows as a mass on a
+damped spring, with a transfer function of second order. Hair swings as a rod that hangs from one end (compare Keller,
+"Ponytail motion", SIAM Journal on Applied Mathematics 70(7), 2010), so that its frequency follows from its length.
+Damping, and both numbers of the neck, are choices, not measurements.
 """
 
 from __future__ import annotations
@@ -64,18 +69,16 @@ def shares(frequency: float, damping: float) -> FloatArray:
 
 
 def follow(performed: Performed, moment: float, amount: float, length: float) -> Lagging:
-    """Delayed controls at a ``moment`` (seconds) for hair of ``length`` metres and for the neck.
-
-    ``amount`` scales the distance to the controls of that moment. Before a sequence the head is still.
-    """
+    """Delayed controls at a ``moment`` (seconds) for hair of ``length`` metres and for the neck. ``amount`` scales the
+    distance to the controls of that moment. Before a sequence the head is still."""
     past = performed.curves(np.maximum(moment - (np.arange(round(_MEMORY * RATE)) + 0.5) / RATE, 0.0))
     now = {name: float(values[0]) for name, values in performed.curves(np.array([moment])).items()}
 
     def late(frequency: float, damping: float) -> Activations:
         # Weights and controls are rounded to grids, so the sums are exact.
         weights = shares(frequency, damping)
-        found: Mapping[str, float] = {name: float((weights * past[name]).sum()) for name in FOLLOWED}
-        moved = {name: now[name] + amount * (found[name] - now[name]) for name in FOLLOWED}
+        late_values: Mapping[str, float] = {name: float((weights * past[name]).sum()) for name in FOLLOWED}
+        moved = {name: now[name] + amount * (late_values[name] - now[name]) for name in FOLLOWED}
         return {**now, **moved}
 
     return Lagging(late(hair_frequency(length), HAIR_DAMPING), late(NECK_FREQUENCY, NECK_DAMPING))

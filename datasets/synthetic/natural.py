@@ -135,8 +135,8 @@ def _steps(
 
 def _rise(time: FloatArray, moment: float, seconds: float) -> FloatArray:
     """(T,) from 0 to 1 by half a cosine of ``seconds`` around a moment."""
-    part = np.clip((time - moment) / seconds + 0.5, 0.0, 1.0)
-    return np.asarray(0.5 - 0.5 * np.cos(np.pi * part))
+    phase = np.clip((time - moment) / seconds + 0.5, 0.0, 1.0)
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * phase))
 
 
 def wander(time: FloatArray, periods: tuple[float, float], rng: np.random.Generator) -> FloatArray:

@@ -140,10 +140,8 @@ def _panel(
 
 
 def window(camera: Camera, points: FloatArray) -> tuple[slice, slice]:
-    """Rows and columns of the image that contain all ``points`` (n, 3), with a margin for the pixel filter.
-
-    The whole image if a point is beside or behind the camera; empty if all are outside.
-    """
+    """Rows and columns of the image that contain all ``points`` (n, 3), with a margin for the pixel filter. The whole
+    image if a point is beside or behind the camera; empty if all are outside."""
     # A row of all x, one of all y, one of all z: by columns this takes a sixth of the time of a whole render.
     seen = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
     size = np.array([camera.width, camera.height])
@@ -157,11 +155,8 @@ def window(camera: Camera, points: FloatArray) -> tuple[slice, slice]:
 
 
 class PanelTracer:
-    """A scene lit by panels; meshes have constant triangles and may change positions and colours.
-
-    ``samples``: Rays per pixel, rounded up to a square number. ``seed``: Seed of the points on the panels that each vertex
-    samples.
-    """
+    """A scene lit by panels; meshes have constant triangles and may change positions and colours. ``samples``: Rays per
+    pixel, rounded up to a square number. ``seed``: Seed of the points on the panels that each vertex samples."""
 
     def __init__(
         self,
@@ -209,9 +204,7 @@ class PanelTracer:
         gloss: FloatArray | None = None,
     ) -> None:
         """Set a mesh's positions and, if they changed, colours and ``gloss``. Takes effect with the next image.
-
-        ``gloss`` (n,) are factors on the panels' reflections: 1 unless given; mirrors have none.
-        """
+        ``gloss`` (n,) are factors on the panels' reflections: 1 unless given; mirrors have none."""
         self._vertices[name] = vertices
         if albedo is not None:
             self._albedo[name] = albedo
@@ -225,12 +218,12 @@ class PanelTracer:
         pixels = np.zeros((camera.height, camera.width, 4))
         rows, columns = window(camera, self._corners)
         if rows.start < rows.stop and columns.start < columns.stop:
-            part = np.zeros((rows.stop - rows.start, columns.stop - columns.start, 4), np.float32)
+            tile = np.zeros((rows.stop - rows.start, columns.stop - columns.start, 4), np.float32)
             world.render(
                 _rays(camera),
-                *(columns.start, rows.start, self._grid, _taps(self._grid), seed, part, self._threads),
+                *(columns.start, rows.start, self._grid, _taps(self._grid), seed, tile, self._threads),
             )
-            pixels[rows, columns] = part
+            pixels[rows, columns] = tile
         alpha = np.clip(pixels[..., 3], 0.0, 1.0)
         return pixels[..., :3] / np.maximum(pixels[..., 3:], 1e-6) * (alpha[..., None] > 0), alpha
 
@@ -246,9 +239,9 @@ class PanelTracer:
                 break
             first += len(points)
         sides = 2 * (first + np.asarray(vertices, np.int64)) + back
-        found = np.zeros((len(sides), 6 + MOST_PANELS), np.float32)
-        world.light(sides, found, self._threads)
-        return found[:, :3], found[:, 3:6], found[:, 6:]
+        rows = np.zeros((len(sides), 6 + MOST_PANELS), np.float32)
+        world.light(sides, rows, self._threads)
+        return rows[:, :3], rows[:, 3:6], rows[:, 6:]
 
     def _current(self) -> Any:
         if self._world is not None and not self._moved:
@@ -294,10 +287,8 @@ _CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
 
 
 def _rays(camera: Camera) -> FloatArray:
-    """(4, 3): the camera's place, and what pixel positions (x, y, 1) are multiplied by to give directions.
-
-    Of single operations in one order: these numbers must not depend on the machine.
-    """
+    """(4, 3): the camera's place, and what pixel positions (x, y, 1) are multiplied by to give directions. Of single
+    operations in one order: these numbers must not depend on the machine."""
     K, rotation, shift = camera.K, camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     place = -(rotation * shift[:, None]).sum(axis=0)
     across = rotation[0] / K[0, 0]

@@ -1,4 +1,9 @@
-"""Eyeballs and parts of the mouth to render. Eyeballs are finer than the tracked ones, with painted cornea, iris and veins."""
+"""Eyeballs and parts of the mouth to render. Eyeballs are finer than the tracked ones, with painted cornea, iris and veins.
+
+Visible but untracked parts of the mouth: teeth, gums and tongue of the default head. They are rendered in synthetic
+captures and are not in the head model: as in a real capture, methods must learn them from the images. The wall of the
+mouth is part of the skin (region ``mouth_socket``).
+"""
 
 from __future__ import annotations
 
@@ -67,10 +72,8 @@ def render_parts(
 
 
 def dental_arch(length: FloatArray, front: float) -> tuple[FloatArray, FloatArray]:
-    """Points (n, 3) at arc ``length`` from the midline along the arch, y = 0, and outward normals (n, 3).
-
-    ``length`` is in metres and ends at ``arch_length()`` on either side.
-    """
+    """Points (n, 3) at arc ``length`` from the midline along the arch, y = 0, and outward normals (n, 3). ``length`` is
+    in metres and ends at ``arch_length()`` on either side."""
     x = np.linspace(-ARCH_REACH, ARCH_REACH, 401)
     px = np.interp(length, _parabola_length(x), x)
     points = np.column_stack([px, 0 * px, front - 26.0 * px**2])
@@ -302,14 +305,16 @@ class TrackedPart:
 
 def tracked_parts(head: HeadAsset) -> tuple[TrackedPart, ...]:
     """Teeth and gums that belong to the tracked mesh."""
-    made = []
+    parts = []
     for region, (color, material) in _TRACKED.items():
         if region not in head.regions:
             continue
         faces = head.faces[np.isin(head.faces, head.regions[region]).all(axis=1)]
         used, local = np.unique(faces, return_inverse=True)
-        made.append(TrackedPart(region, used, local.reshape(-1, 3), np.tile(color, (len(used), 1)), material))
-    return tuple(made)
+        parts.append(
+            TrackedPart(region, used, local.reshape(-1, 3), np.tile(color, (len(used), 1)), material)
+        )
+    return tuple(parts)
 
 
 def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
@@ -353,11 +358,11 @@ def tongue(person: Person, anatomy: Anatomy, joints: int) -> MouthPart:
 def procedural_parts(person: Person, head: HeadAsset, shape: FloatArray) -> tuple[MouthPart, ...]:
     """Teeth, gums and tongue that come with the procedural head, for a subject's identity (S,)."""
     colors = {"teeth": _TEETH, "gums": _GUMS, "tongue": _TONGUE}
-    made = []
+    rows = []
     for part, out in zip(render_parts(head, shape), render_parts(head, shape, tongue_out=1.0)):
         mottled = 1.0 + 0.08 * value_noise(part.vertices / 0.0014, person.seed + 95)
         albedo = colors[part.material] * mottled[:, None]
-        made.append(
+        rows.append(
             MouthPart(
                 part.name,
                 part.vertices,
@@ -368,7 +373,7 @@ def procedural_parts(person: Person, head: HeadAsset, shape: FloatArray) -> tupl
                 part.material,
             )
         )
-    return tuple(made)
+    return tuple(rows)
 
 
 HIDES = 20e-6

@@ -52,10 +52,8 @@ _GAZE_SIDE, _GAZE_UP = 0.45, 0.32
 
 @dataclass(frozen=True, eq=False)
 class Translation:
-    """From expression controls to one head model: ``expression`` (K, E) and, where it has them, eyelids (K, 2).
-
-    Both stand on the grid of coefficients, as activations do: their products and sums are exact.
-    """
+    """From expression controls to one head model: ``expression`` (K, E) and, where it has them, eyelids (K, 2). Both
+    stand on the grid of coefficients, as activations do: their products and sums are exact."""
 
     head_model: str
     expression: FloatArray
@@ -292,9 +290,7 @@ _MINIMUM = 8  # minimum timesteps of an additional sequence
 @dataclass(frozen=True, eq=False)
 class Performed:
     """A performed sequence: one dictionary of controls per timestep, the timesteps to label, and seconds between two.
-
-    ``moments`` (T,) are the timesteps in seconds, and ``curves`` are the controls at any moments (n,), (n,) each.
-    """
+    ``moments`` (T,) are the timesteps in seconds, and ``curves`` are the controls at any moments (n,), (n,) each."""
 
     name: str
     activations: Sequence[Mapping[str, float]]
@@ -372,8 +368,8 @@ def perform(
         moments = _moments(name, timesteps, seconds, begin())
 
     def curves(time: FloatArray) -> Curves:
-        made = _natural_curves if kind == "natural" else _smooth_curves
-        values = made(name, time, seconds, begin())
+        make_curves = _natural_curves if kind == "natural" else _smooth_curves
+        values = make_curves(name, time, seconds, begin())
         values |= {control: np.zeros(len(time)) for control in CONTROLS if control not in values}
         # Lids follow the eyes down.
         for side in SIDES:

@@ -44,10 +44,8 @@ _TRAITS, _BLOCK = 5, 10  # traits that are distributed evenly over every ten sub
 
 
 def spread(seed: int, index: int) -> FloatArray:
-    """(5,) numbers in [0, 1): a Latin hypercube over every ten subjects of a seed.
-
-    They are skin tone, age, hair style, beard and glasses.
-    """
+    """(5,) numbers in [0, 1): a Latin hypercube over every ten subjects of a seed. They are skin tone, age, hair style,
+    beard and glasses."""
     rng = np.random.default_rng([seed, 21, index // _BLOCK])
     tenths = np.stack([rng.permutation(_BLOCK) for _ in range(_TRAITS)], axis=1)
     return (tenths + rng.random((_BLOCK, _TRAITS)))[index % _BLOCK] / _BLOCK
@@ -229,10 +227,8 @@ def plan_subject(out: Path, index: int, geometry: Geometry, settings: SyntheticS
 
 
 def _middle(anatomy: Anatomy, neutral: FloatArray, style: Style) -> FloatArray:
-    """Target of the cameras: near the middle of the head with its hair, at rest, so high that the bust's end is not visible.
-
-    Only parts above the chin count: neck and shoulders need not be in the frame from every side.
-    """
+    """Target of the cameras: near the middle of the head with its hair, at rest, so high that the bust's end is not
+    visible. Only parts above the chin count: neck and shoulders need not be in the frame from every side."""
     skin = neutral[np.unique(anatomy.skin_faces)]
     above = skin[skin[:, 1] > anatomy["chin"][1]]
     low, high = above.min(axis=0), above.max(axis=0)
@@ -309,10 +305,8 @@ PROCEDURAL = ("procedural", "procedural2020", "procedural2023")
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """A head model that can be animated and rendered.
-
-    ``mouth(person, anatomy, shape)`` makes the parts in the mouth that the head model lacks.
-    """
+    """A head model that can be animated and rendered. ``mouth(person, anatomy, shape)`` makes the parts in the mouth
+    that the head model lacks."""
 
     head: HeadArrays
     translation: Translation

@@ -1,4 +1,7 @@
-"""Renders a subject's frames with `panels` and converts them to 8-bit images and masks."""
+"""Renders a subject's frames with `panels` and converts them to 8-bit images and masks.
+
+Ground truth of a synthetic capture for poses and views without recorded images.
+"""
 
 from __future__ import annotations
 
@@ -105,9 +108,7 @@ def outline(camera: Camera, vertices: FloatArray, faces: IntArray) -> BoolArray:
 
 def hair_pixels(hair: BoolArray, skin: BoolArray, metre: float) -> FloatArray:
     """(H, W) in [0, 1] how far pixels belong to hair: 0 where skin is nearer, by what hair and skin cover (H, W).
-
-    ``metre`` is the number of pixels of a metre at the head.
-    """
+    ``metre`` is the number of pixels of a metre at the head."""
     return np.clip((_distance(skin) - _distance(hair)) / max(_BETWEEN * metre, 1.0), 0.0, 1.0)
 
 
@@ -132,8 +133,8 @@ def matte(alpha: FloatArray, hair: FloatArray, level: float, metre: float, seed:
     place = np.stack([columns.ravel(), rows.ravel(), np.zeros(alpha.size)], axis=1).astype(np.float64)
     field = fractal_noise(place, MATTE_PERIOD * metre, seed, 2).reshape(alpha.shape)
     edge = signed + level * MATTE_METRES * metre * field
-    found = np.clip(0.5 + edge / max(reach, 1.0), 0.0, 1.0)
-    return alpha + min(level, 1.0) * hair * (found - alpha)
+    alpha_mask = np.clip(0.5 + edge / max(reach, 1.0), 0.0, 1.0)
+    return alpha + min(level, 1.0) * hair * (alpha_mask - alpha)
 
 
 def develop(
@@ -198,10 +199,8 @@ class CaptureRenderer:
         return sub_frames(moved, float(self._plan.cameras[FRONTAL].K[0, 0]), CAMERA_DISTANCE, shutter)
 
     def pose_at(self, sequence: str, timestep: int, offset: float = 0.0) -> None:
-        """Pose all meshes for a timestep, with the state of the skin that results from previous timesteps.
-
-        ``offset`` is the time from there in seconds: what moves in it is not the state of the skin.
-        """
+        """Pose all meshes for a timestep, with the state of the skin that results from previous timesteps. ``offset``
+        is the time from there in seconds: what moves in it is not the state of the skin."""
         plan, performed = self._plan, self._plan.performed[sequence]
         if sequence not in self._states:
             self._states[sequence] = over_time(performed.activations, performed.step, plan.person)
@@ -229,10 +228,8 @@ class CaptureRenderer:
     def render_view(
         self, view: Camera, seed: int, background: FloatArray | None = None
     ) -> tuple[ByteArray, ByteArray]:
-        """(H, W, 3) 8-bit image on a background (3,), by default the capture's, and (H, W) foreground mask, without motion in an exposure.
-
-        A camera that is not of the rig has no response of its own (`--camera-colour`).
-        """
+        """(H, W, 3) 8-bit image on a background (3,), by default the capture's, and (H, W) foreground mask, without
+        motion in an exposure. A camera that is not of the rig has no response of its own (`--camera-colour`)."""
         return self._developed(view, seed, *self._tracer.image(view, seed), background)
 
     def _developed(
@@ -243,22 +240,22 @@ class CaptureRenderer:
         alpha: FloatArray,
         background: FloatArray | None = None,
     ) -> tuple[ByteArray, ByteArray]:
-        settings, found = self._plan.settings, None
+        settings, estimate = self._plan.settings, None
         if settings.camera_colour and view.id in SERIALS:
             rgb = draw_response(settings.camera_colour, settings.seed, SERIALS.index(view.id))(rgb)
         if settings.mask_error:
             metre = float(view.K[0, 0]) / CAMERA_DISTANCE
-            found = matte(alpha, self.hair_pixels(view), settings.mask_error, metre, seed)
+            estimate = matte(alpha, self.hair_pixels(view), settings.mask_error, metre, seed)
         ground = self._plan.writer.plan.background if background is None else background
-        return develop(rgb, alpha, np.asarray(ground), found)
+        return develop(rgb, alpha, np.asarray(ground), estimate)
 
     def hair_pixels(self, view: Camera) -> FloatArray:
         """(H, W) in [0, 1] how far pixels belong to hair on the head in the present pose."""
         skin, locks = (self._posed[name].vertices for name in ("skin", "hair"))
         faces = self._fixed["skin"].faces
-        grown = self._subject.hair_share[faces].mean(axis=1) > 0.5
-        hair = outline(view, locks, self._fixed["hair"].faces) | outline(view, skin, faces[grown])
-        return hair_pixels(hair, outline(view, skin, faces[~grown]), float(view.K[0, 0]) / CAMERA_DISTANCE)
+        hairy = self._subject.hair_share[faces].mean(axis=1) > 0.5
+        hair = outline(view, locks, self._fixed["hair"].faces) | outline(view, skin, faces[hairy])
+        return hair_pixels(hair, outline(view, skin, faces[~hairy]), float(view.K[0, 0]) / CAMERA_DISTANCE)
 
     def _activations(self, sequence: str, timestep: int, offset: float) -> Activations:
         performed = self._plan.performed[sequence]
@@ -297,12 +294,12 @@ class SyntheticTruth:
         self._settings = _settings(clip)
         KERNEL.load()
         self._geometry = load_geometry(self._settings.head)
-        made = self._geometry.head.version
-        if clip.head.version != made:
+        version = self._geometry.head.version
+        if clip.head.version != version:
             raise UnavailableError(
-                f"The clip has poses of {clip.head.version}; the true person is rendered in poses of {made}.",
+                f"The clip has poses of {clip.head.version}; the true person is rendered in poses of {version}.",
                 "Make the capture with that head model (`headbench synth --head`).",
-                f"poses are of {clip.head.version}, the truth is of {made}",
+                f"poses are of {clip.head.version}, the truth is of {version}",
             )
         self.fingerprint = digest(
             asdict(self._settings), EDITION, clip.subject, self._geometry.head.fingerprint(), self._background

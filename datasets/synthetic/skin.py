@@ -41,10 +41,8 @@ class SkinPaint:
 def paint_skin(
     person: Person, anatomy: Anatomy, points: FloatArray, normals: FloatArray, cavity: FloatArray
 ) -> SkinPaint:
-    """Paint the fine skin points (N, 3) of a neutral subject.
-
-    ``normals`` (N, 3) point outwards; ``cavity`` (N,) is the share of each point in the mouth's wall.
-    """
+    """Paint the fine skin points (N, 3) of a neutral subject. ``normals`` (N, 3) point outwards; ``cavity`` (N,) is the
+    share of each point in the mouth's wall."""
     s, seed = anatomy.scale, person.seed
     color = np.tile(person.skin, (len(points), 1))
     red = person.skin * np.array([1.02, 0.66, 0.62])
@@ -304,10 +302,8 @@ def flush_strengths(a: Activations) -> FloatArray:
 def make_folds(
     person: Person, anatomy: Anatomy, points: FloatArray, lips: FloatArray, bare: FloatArray
 ) -> Folds:
-    """Define the folds on the neutral fine skin, (N, 3) points.
-
-    ``lips`` (N,) is the share of the lips' red; ``bare`` (N,) is 0 where hair hides the skin.
-    """
+    """Define the folds on the neutral fine skin, (N, 3) points. ``lips`` (N,) is the share of the lips' red; ``bare``
+    (N,) is 0 where hair hides the skin."""
     sketch = _Sketch(person, anatomy, points)
     groups = sketch.groups()
     height = np.stack([groups[name][0] for name in FOLDS]) * (person.lines * person.dynamics)
@@ -327,14 +323,14 @@ class _Sketch:
         self._front = cKDTree(points)
 
     def groups(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        made = self._forehead() | {"glabella": self._glabella(), "bunny": self._bunny()}
-        made |= {"chin": self._chin(), "lip_lines": self._lip_lines(), "neck": self._neck()}
+        regions = self._forehead() | {"glabella": self._glabella(), "bunny": self._bunny()}
+        regions |= {"chin": self._chin(), "lip_lines": self._lip_lines(), "neck": self._neck()}
         for side, sign in zip(SIDES, (1.0, -1.0)):
-            made[f"crow_{side}"] = self._crow(side, sign)
-            made[f"nasolabial_{side}"] = self._nasolabial(side, sign)
-            made[f"under_eye_{side}"] = self._under_eye(side)
-            made[f"dimple_{side}"] = self._dimple(side, sign)
-        return made
+            regions[f"crow_{side}"] = self._crow(side, sign)
+            regions[f"nasolabial_{side}"] = self._nasolabial(side, sign)
+            regions[f"under_eye_{side}"] = self._under_eye(side)
+            regions[f"dimple_{side}"] = self._dimple(side, sign)
+        return regions
 
     def flush(self, name: str, lips: FloatArray) -> FloatArray:
         a, p, s = self.anatomy, self.points, self.s

@@ -165,7 +165,7 @@ def make_correctives(
     skin[anatomy.skin_faces] = True
     basis = np.asarray(head.expression_basis, np.float64)
     face = np.intersect1d(region(head, "face"), np.flatnonzero(skin))
-    made = []
+    strips = []
     for number, pair in enumerate(DRIVERS):
         rows = [EXPRESSION_CONTROLS.index(name) for name in pair if name in EXPRESSION_CONTROLS]
         moved = np.linalg.norm(basis @ translation.expression[rows].sum(axis=0), axis=1)
@@ -174,8 +174,8 @@ def make_correctives(
         reach = np.where(skin, moved / (moved + _BROAD * moved[skin].max()), 0.0)
         field = _beyond(basis, reach[:, None] * np.stack(noise, axis=1), skin)
         amount = on_grid(1e-3 * FACE_MM / np.sqrt((field[face] ** 2).sum(axis=1).mean()), LENGTH_BITS)
-        made.append(without_joints(head, amount * field))
-    return np.stack(made)
+        strips.append(without_joints(head, amount * field))
+    return np.stack(strips)
 
 
 def _beyond(basis: FloatArray, field: FloatArray, skin: FloatArray) -> FloatArray:
@@ -223,18 +223,15 @@ class RestMesh:
 
 @dataclass(frozen=True, eq=False)
 class LatePoses:
-    """Delayed poses of hair and neck, see `lag`."""
+    """Delayed poses of hair and neck, see `history`."""
 
     hair: HeadPose
     neck: HeadPose
 
 
 class RenderedSubject:
-    """A subject's visible body over a head model.
-
-    ``shape``: (S,) identity coefficients. ``correctives``: Level of shapes of the skin that the head model lacks, see
-    `correctives`.
-    """
+    """A subject's visible body over a head model. ``shape``: (S,) identity coefficients. ``correctives``: Level of
+    shapes of the skin that the head model lacks, see `correctives`."""
 
     def __init__(
         self, person: Person, geometry: Geometry, shape: FloatArray, correctives: float = 0.0
@@ -317,9 +314,7 @@ class RenderedSubject:
         self, pose: HeadPose, activations: Activations, state: SkinState, late: LatePoses | None = None
     ) -> dict[str, PosedMesh]:
         """All meshes in a pose, with the tongue of the ``activations``, and wrinkles and colour of a state of skin.
-
-        Hair and the skin of the neck are drawn towards the ``late`` poses.
-        """
+        Hair and the skin of the neck are drawn towards the ``late`` poses."""
         tracked = self._shown(pose, activations)
         joints = self._joint_motions(pose)
         hair = _moved(joints[HEAD_JOINT], self._hair.vertices)
@@ -333,27 +328,27 @@ class RenderedSubject:
         gloss = None if self._gloss is None else self._stretched_gloss(tracked, self._gloss, state.wet)
         outer = points + (lift + self._cap)[:, None] * normals
         bare = points + lift[:, None] * normals
-        made = {
+        meshes = {
             "skin": PosedMesh(outer, albedo, gloss),
             "hair": PosedMesh(hair, None),
             "brows": PosedMesh(self._rooted_vertices(self._brows, self._brow_frames, tracked, bare), None),
         }
         if self._beard and self._beard_frames is not None:
-            grown = self._rooted_vertices(self._beard, self._beard_frames, tracked, outer)
-            made["beard"] = PosedMesh(grown, None)
+            beard = self._rooted_vertices(self._beard, self._beard_frames, tracked, outer)
+            meshes["beard"] = PosedMesh(beard, None)
         if self._glasses:
-            made["glasses"] = PosedMesh(_moved(joints[HEAD_JOINT], self._glasses.vertices), None)
+            meshes["glasses"] = PosedMesh(_moved(joints[HEAD_JOINT], self._glasses.vertices), None)
         for side, joint in zip(SIDES, EYE_JOINTS):
-            made[f"eye_{side}"] = PosedMesh(_moved(joints[joint], self._eyes[side].vertices), None)
+            meshes[f"eye_{side}"] = PosedMesh(_moved(joints[joint], self._eyes[side].vertices), None)
         for inner in self._tracked_parts:
-            made[inner.name] = PosedMesh(tracked[inner.vertices], None)
+            meshes[inner.name] = PosedMesh(tracked[inner.vertices], None)
         for part in self._mouth:
             rest = part.at(activations["tongue_out"])
             blended = np.einsum("nj,jab->nab", part.weights, joints)
-            made[part.name] = PosedMesh(
+            meshes[part.name] = PosedMesh(
                 np.einsum("nab,nb->na", blended[..., :3], rest) + blended[..., 3], None
             )
-        return made
+        return meshes
 
     def _stretched_gloss(self, tracked: FloatArray, rest: FloatArray, wet: float) -> FloatArray:
         """Skin that is stretched loses its fine relief and shines more; so do wet lips."""

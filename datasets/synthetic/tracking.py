@@ -104,8 +104,8 @@ def with_tracking_error(
     begins = {0, *itertools.accumulate(map(len, sequences.values()))}
     if tracker == "video":
         assert steps is not None
-        apart = np.concatenate([np.full(len(each), steps[name]) for name, each in sequences.items()])
-        drift: Callable[[tuple[int, ...]], FloatArray] = lambda shape: _lasting(shape, begins, apart, rng)
+        intervals = np.concatenate([np.full(len(each), steps[name]) for name, each in sequences.items()])
+        drift: Callable[[tuple[int, ...]], FloatArray] = lambda shape: _lasting(shape, begins, intervals, rng)
         detail = VIDEO_DETAIL_MM
     else:
         drift, detail = (lambda shape: DRIFT * _drift(shape, begins, PERSISTENCE, rng)), DETAIL_MM
@@ -142,7 +142,7 @@ def with_tracking_error(
     }
     if tracker == "video":
         for name, column, amount in _OWN_JITTER:
-            kept = share_left(apart, JITTER_SECONDS)
+            kept = share_left(intervals, JITTER_SECONDS)
             total[name][:, column] += level * amount * _drift((len(poses), 1), begins, kept, rng)
     moved = iter(_moved(poses, total))
     return {name: [next(moved) for _ in each] for name, each in sequences.items()}

@@ -88,8 +88,8 @@ def import_tracking(settings: ImportTrackingSettings, progress: Progress = no_pr
     masks are linked, others are composited on white), and ``import.json``.
     """
     from ..clip import check_apart
+    from ..ga.writer import capture_plan, write_capture
     from ..head.refit.command import target_head
-    from ..head.refit.rewrite import capture_plan, write_capture
     from ..images import write_image
     from ..inspect.figure import draw_overlay
     from ..monocular.clip import clip_of_track, subject_of

@@ -1,4 +1,27 @@
-"""Supported trackers; add a new tracker as an entry of this table."""
+"""Supported trackers; add a new tracker as an entry of this table.
+
+Metrical Tracker's files, as its own program, FlashAvatar and INSTA's script read them. Root and neck rest; the head's
+motion is in the camera. ``opencv`` has world-to-camera with OpenCV's axes and K in pixels of the tracked image, both
+made by PyTorch3D, whose image starts at the corner of the first pixel. Rotations are the first two rows of matrices.
+The order of ``img_size`` is height, width. ``camera`` (the same in PyTorch3D's form), texture ``tex`` and light ``sh``
+are not read.
+
+Pixel3DMM's files. FLAME is posed with its root at rest, then moved by ``R`` and ``t`` about the origin (not about the
+root joint), then seen by a camera with OpenGL's axes, ``R_base_0`` and ``t_base_0``. The focal length ``fl`` is in
+widths of the square tracked image, and the principal point is (1 + pp) (size / 2 + 1/2). This is how the program draws
+the mesh. Its landmarks are projected with an offset of one pixel of the tracked image (256 pixels by default) in x, so
+a residual of that size is its own. Rotations are the first two rows of matrices. In its masks, labels of parts are 1 to
+18, background is 0, and what lies outside the parsed box is 20. ``joint_transforms`` follow from the other parameters
+and are not read.
+
+Formats read:
+
+- Metrical Tracker's `checkpoint/*.frame`. Written by Zielon/metrical-tracker@c2a51724 (`tracker.py`). Not checked on a file of the program.
+- Pixel3DMM's `checkpoint/*.frame`. Written by SimonGiebenhain/pixel3dmm@98b5d79f (`src/pixel3dmm/tracking/tracker.py`).
+  Checked on tobias-kirschstein/flexavatar@c1a31a74
+  `data/pixel3dmm_processing/tracking/itw/einstein/tracking_nV1_noPho_uv2000.0_n1000.0/checkpoint/00000.frame` (rotations
+  equal its matrices `R_rotation_matrix` and `joint_transforms`).
+"""
 
 from __future__ import annotations
 

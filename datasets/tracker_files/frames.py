@@ -1,4 +1,8 @@
-"""Timesteps in files of trackers, ``checkpoint/00012.frame``: files of ``torch.save`` with dictionaries of arrays."""
+"""Timesteps in files of trackers, ``checkpoint/00012.frame``: files of ``torch.save`` with dictionaries of arrays.
+
+Images and masks of tracked frames, found by the numbers in their names. A tracked video of a tracker's frames, their
+images and a head model.
+"""
 
 from __future__ import annotations
 
@@ -51,11 +55,8 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True)
 class VideoPictures:
-    """Files by frame number.
-
-    ``masks`` describes the masks, "" if there are none; ``solid`` is `Track.solid`. ``unused`` is the number of images without
-    a tracked frame.
-    """
+    """Files by frame number. ``masks`` describes the masks, "" if there are none; ``solid`` is `Track.solid`.
+    ``unused`` is the number of images without a tracked frame."""
 
     frames: Mapping[int, Picture]
     folder: Path
@@ -80,22 +81,24 @@ def find_pictures(
     layout.
     """
     folder = _image_folder(root, layout, images)
-    found = _numbered(folder)
+    numbered = _numbered(folder)
     if first is None:
         known = layout.images.get(folder.name)
-        first = min(found) if known is None else known
+        first = min(numbered) if known is None else known
     wanted = {number: number + first for number in numbers}
-    missing = [(number, image) for number, image in wanted.items() if image not in found]
+    missing = [(number, image) for number, image in wanted.items() if image not in numbered]
     if missing:
         number, image = missing[0]
         expected = f"an image for each frame, such as {image:05d}.png for frame {number}"
-        held = f"images {min(found)} to {max(found)}, and none for {len(missing)} of {len(wanted)} frames"
+        held = (
+            f"images {min(numbered)} to {max(numbered)}, and none for {len(missing)} of {len(wanted)} frames"
+        )
         remedy = f"Frame 0 was taken to be image {first}: another one is given by --first-image, another folder by --images."
         raise InputError(folder, "", expected, held, remedy)
     sources = _mask_folders(folder, layout, masks)
     pictures = {}
     for number, image in wanted.items():
-        path = found[image]
+        path = numbered[image]
         info = probe_image(path)
         mask, inside = (_of_image(one, path, image, info) for one in (sources.mask, sources.inside))
         if mask is None and inside is not None:
@@ -110,7 +113,7 @@ def find_pictures(
         first=first,
         masks="" if plain else sources.described() or "alpha channels of the images",
         solid=((layout.subject[0] - 0.5) / 255, (layout.subject[1] + 0.5) / 255) if sources.labels else None,
-        unused=len(found) - len(pictures),
+        unused=len(numbered) - len(pictures),
     )
 
 
@@ -179,13 +182,13 @@ def _of_image(masks: Mapping[int, Path], image: Path, number: int, info: ImageIn
 
 def _numbered(folder: Path, ending: str = "") -> dict[int, Path]:
     """Images of a folder by the number in their names, which end as given; a PNG before a JPEG of the same number."""
-    found = {}
+    parameters = {}
     for path in sorted(entries(folder), key=lambda path: path.suffix.lower()):
         stem = path.stem.removesuffix(ending)
         named = path.stem.endswith(ending) and stem.isascii() and stem.isdecimal() and len(stem) < 10
         if named and path.suffix.lower() in IMAGES:
-            found[int(stem)] = path
-    return found
+            parameters[int(stem)] = path
+    return parameters
 
 
 FOLDER, SUFFIX = "checkpoint", ".frame"
@@ -193,10 +196,8 @@ FOLDER, SUFFIX = "checkpoint", ".frame"
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """One timestep as a tracker found it, in this project's units and axes; the same for all trackers.
-
-    The head's root is at rest in the world of ``world_to_camera``: its motion is in the camera.
-    """
+    """One timestep as a tracker found it, in this project's units and axes; the same for all trackers. The head's root
+    is at rest in the world of ``world_to_camera``: its motion is in the camera."""
 
     file: Path
     number: int
@@ -225,25 +226,25 @@ Convert = Callable[[Path, int, Mapping[str, np.ndarray]], TrackedFrame]
 
 def frame_files(root: Path) -> dict[int, Path]:
     """Files of the timesteps by number, in ``root`` or its folder ``checkpoint``; {} if there are none."""
-    found: dict[int, Path] = {}
+    files: dict[int, Path] = {}
     for path in entries(root, f"*{SUFFIX}") or entries(root / FOLDER, f"*{SUFFIX}"):
         number = frame_number(path, "", path.stem)
-        if number in found:
+        if number in files:
             raise InputError(
-                path, "", "every frame once", f"frame {number} again, which is {found[number].name} too"
+                path, "", "every frame once", f"frame {number} again, which is {files[number].name} too"
             )
-        found[number] = path
-    return dict(sorted(found.items()))
+        files[number] = path
+    return dict(sorted(files.items()))
 
 
 def read_members(path: Path) -> dict[str, np.ndarray]:
     """All arrays of a file, with dots in the names of those in dictionaries inside."""
-    found: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
     for name, value in read_saved(path).items():
         inside: Mapping[str, Any] = value if isinstance(value, dict) else {}
         named = {name: value, **{f"{name}.{key}": part for key, part in inside.items()}}
-        found |= {key: array for key, array in named.items() if isinstance(array, np.ndarray)}
-    return found
+        arrays |= {key: array for key, array in named.items() if isinstance(array, np.ndarray)}
+    return arrays
 
 
 def read_frames(
@@ -301,7 +302,7 @@ def video_track(
     ``resized``: Whether images may have another size than the ones tracked, with the same ratio of width to height.
     """
     identities, expressions = head.shape_basis.shape[2], head.expression_basis.shape[2]
-    found = []
+    numbers = []
     for frame in frames:
         picture = pictures.frames[frame.number]
         pose = HeadPose(
@@ -315,7 +316,7 @@ def video_track(
             eyelids=None if head.eyelid_basis is None else frame.eyelids,
         )
         camera = _camera(frame, picture, resized=resized)
-        found.append(
+        numbers.append(
             VideoFrame(
                 where=(frame.file, ""),
                 sequence=VIDEO,
@@ -329,7 +330,7 @@ def video_track(
         )
     first = frames[0]
     return Track(
-        frames=ordered(root, found),
+        frames=ordered(root, numbers),
         shape=coefficients(first.file, "flame.shape", first.shape, identities),
         held_out=None,
         files=frozenset(frame.file for frame in frames),

@@ -43,7 +43,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     ``overlay.png``. Intermediate results are stored there, so that an interrupted call can be resumed.
     """
     from ..clip import check_apart
-    from ..head.refit.rewrite import capture_plan, write_capture
+    from ..ga.writer import capture_plan, write_capture
     from ..images import write_image
     from ..inspect.figure import draw_overlay
     from ..steps.masks import label_files, without_torso

@@ -1,4 +1,8 @@
-"""Fit a head model to images: landmarks first, then colours of surface points."""
+"""Fit a head model to images: landmarks first, then colours of surface points.
+
+Gauss-Newton steps for the poses of all timesteps and one shape: normal equations with an arrowhead matrix. The focal
+length of one camera from landmarks of a head model.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +17,7 @@ from scipy.sparse import csr_array
 from ...bench.contracts import Camera, FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError
 from .landmarks import ImageLandmarks, spread_vertices
-from .rig import PointRig, PoseColumns, PosedPoints
-from .views import FrameStack, Occlusion, Views
+from .rig import FrameStack, Occlusion, PointRig, PoseColumns, PosedPoints, Views
 
 
 class HeadState(NamedTuple):
@@ -58,10 +61,8 @@ class NormalEquations:
         self._rights[timestep] += flat.T @ slope.astype(jacobian.dtype).reshape(-1)
 
     def step(self, state: HeadState, prior: HeadPrior, damping: float = 1e-6) -> HeadState:
-        """The state after a step with the prior.
-
-        ``damping``: Fraction of the diagonal that is added to it (Levenberg-Marquardt).
-        """
+        """The state after a step with the prior. ``damping``: Fraction of the diagonal that is added to it
+        (Levenberg-Marquardt)."""
         split = self._split
         deviations = np.concatenate([prior.pose, prior.shape])
         free = deviations > 0
@@ -193,10 +194,8 @@ class Fitter:
         return HeadPrior(np.array([*ANGLE_SPREAD, *free, *coefficients]), shape)
 
     def start(self, shape: FloatArray | None = None) -> HeadState:
-        """A shape, by default the mean, in the rigid pose of the landmarks of one camera at each timestep.
-
-        Of the cameras that saw most landmarks it is the one whose pose fits the landmarks of all cameras best.
-        """
+        """A shape, by default the mean, in the rigid pose of the landmarks of one camera at each timestep. Of the
+        cameras that saw most landmarks it is the one whose pose fits the landmarks of all cameras best."""
         columns = PoseColumns.of(self.head)
         poses = np.zeros((len(self.landmarks.pixels), columns.size))
         shape = np.zeros(self.head.shape_basis.shape[2]) if shape is None else shape
@@ -206,16 +205,16 @@ class Fitter:
         root = np.asarray(self.head.joint_regressor[0], np.float64) @ neutral
         last = np.zeros(6)
         for row, pixels in enumerate(self.landmarks.pixels):
-            found = np.isfinite(pixels[..., 0])
+            seen = np.isfinite(pixels[..., 0])
             least = np.inf
-            for camera in np.argsort(-found.sum(axis=1), kind="stable")[:_TRIED]:
-                kept = found[camera]
+            for camera in np.argsort(-seen.sum(axis=1), kind="stable")[:_TRIED]:
+                kept = seen[camera]
                 if kept.sum() < _FEWEST:
                     continue
                 turn, moved = self._rigid(rest[kept], pixels[camera, kept], camera)
                 gaps = np.linalg.norm(self.views.place(rest @ turn.T + moved)[0] - pixels, axis=2)
-                if np.median(gaps[found]) < least:
-                    least = float(np.median(gaps[found]))
+                if np.median(gaps[seen]) < least:
+                    least = float(np.median(gaps[seen]))
                     last = np.concatenate([cv2.Rodrigues(turn)[0][:, 0], moved - root + turn @ root])
             poses[row, :3], poses[row, columns.translation] = last[:3], last[3:]
         return HeadState(shape, poses)
@@ -240,17 +239,17 @@ class Fitter:
         for row, pixels in enumerate(self.landmarks.pixels):
             posed = rig.linearised(state.shape, state.poses[row])
             projected = self.views.project(posed.points)
-            found = np.isfinite(pixels[..., 0])
-            gap = np.where(found[..., None], pixels - projected.pixels, 0.0)
+            seen = np.isfinite(pixels[..., 0])
+            gap = np.where(seen[..., None], pixels - projected.pixels, 0.0)
             per_metre = self.views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
             sigma = 1e-3 * LANDMARK_MM * per_metre
             square = (gap**2).sum(axis=2)
             # All landmarks of an image may be wrong if the network detects something else as a face.
             if leave_out:
                 near = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
-                found &= ((found & near).sum(axis=1) > found.sum(axis=1) / 2)[:, None]
-            robust = found * self.landmark_weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
-            distance[row] = np.sqrt((found * square).sum() / max(found.sum(), 1))
+                seen &= ((seen & near).sum(axis=1) > seen.sum(axis=1) / 2)[:, None]
+            robust = seen * self.landmark_weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
+            distance[row] = np.sqrt((seen * square).sum() / max(seen.sum(), 1))
             weighted = robust[..., None, None] * projected.derivative
             curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
             slope = np.einsum("cpki,cpk->pi", weighted, gap)
@@ -276,9 +275,7 @@ class Fitter:
         progress: Progress = no_progress,
     ) -> Fitted:
         """Steps on colours of points and landmarks at the blurs of `LEVELS`, with or without optimising the shape.
-
-        ``stack`` holds the images of all timesteps, the cameras of each together.
-        """
+        ``stack`` holds the images of all timesteps, the cameras of each together."""
         vertices = sampled_vertices(self.head)
         rig = PointRig.at_vertices(self.head, vertices)
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
@@ -364,8 +361,8 @@ def _texture(
         texture = np.stack(sums, axis=1) / total[:, None]
         square = ((values - texture[samples.point]) ** 2).sum(axis=1)
         # Points whose colour changes with light or expression count less than those whose colour stays.
-        own = np.bincount(samples.point, robust * square, points) / total
-        scale = tolerance * np.maximum(own, max(float(np.median(square)), 1e-5))[samples.point]
+        mean_square = np.bincount(samples.point, robust * square, points) / total
+        scale = tolerance * np.maximum(mean_square, max(float(np.median(square)), 1e-5))[samples.point]
         robust = weight / (1 + square / scale) ** 2
     return texture.astype(np.float32), (3 * robust / scale).astype(np.float32)
 
@@ -405,10 +402,10 @@ def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, s
     ``landmarks``: (T, 1, L, 2) pixels of ``camera``. ``side``: Longer side of the camera's whole picture in pixels of
     ``camera``, before it was cropped.
     """
-    part = landmarks.of(landmarks.seen)
-    part = part.of(np.unique(np.linspace(0, len(part.pixels) - 1, FRAMES).astype(int)))
+    sample = landmarks.of(landmarks.seen)
+    sample = sample.of(np.unique(np.linspace(0, len(sample.pixels) - 1, FRAMES).astype(int)))
     tried = side * np.array(TRIED)
-    residuals = np.array([_residual(head, camera, part, focal) for focal in tried])
+    residuals = np.array([_residual(head, camera, sample, focal) for focal in tried])
     best = int(residuals.argmin())
     pixels = tried[best]
     if 0 < best < len(tried) - 1:

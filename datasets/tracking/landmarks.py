@@ -1,4 +1,8 @@
-"""Landmarks in images: sources, and corresponding points of the mesh."""
+"""Landmarks in images: sources, and corresponding points of the mesh.
+
+Embedding of a network's landmarks on a head model. Landmarks by MediaPipe's face landmark network, and their places on
+a head, found in drawings of it.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,7 @@ from ..head.geometry import vertex_normals
 from ..head.model import PosedSubject
 from ..head.refit.identity import closest_points
 from ..mesh_pictures import draw_mesh, rasterize_mesh
-from .views import Occlusion, Views
+from .rig import Occlusion, Views
 
 LEARNING_FRAMES = 120
 """Images of a capture from which an embedding is learnt."""
@@ -82,17 +86,17 @@ def learn_embedding(
     """Positions of the network's landmarks on the mesh: medians over images."""
     template = np.asarray(head.template, np.float64)
     places: list[FloatArray] = []
-    found: FloatArray | None = None
+    previous: FloatArray | None = None
     last = ""
     for image, camera, mesh in pictures:
         progress(len(places), max(LEARNING_FRAMES, len(places) + 1), "learning landmarks")
-        found = network.find(image, found if camera.id == last else None)
+        previous = network.find(image, previous if camera.id == last else None)
         last = camera.id
         places.append(np.full((COUNT, 3), np.nan))
-        if found is None:
+        if previous is None:
             continue
         fragments = rasterize_mesh(mesh, head.faces, camera)
-        column, line = np.floor(found).astype(int).T
+        column, line = np.floor(previous).astype(int).T
         inside = (column >= 0) & (line >= 0) & (column < camera.width) & (line < camera.height)
         column, line = np.where(inside, column, 0), np.where(inside, line, 0)
         face, weights = fragments.face[line, column], fragments.weights[line, column]
@@ -193,8 +197,8 @@ def known_rig_landmarks(
         projected = views.project(mesh[vertices])
         per_metre = views.intrinsics[:, None, 0, 0] / projected.depth
         error = 1e-3 * (BIAS_MM * bias + NOISE_MM * rng.standard_normal(size))
-        found = projected.pixels + error * per_metre[..., None]
-        pixels[row] = np.where(cosine[..., None] > 0.5, found, np.nan)
+        detected = projected.pixels + error * per_metre[..., None]
+        pixels[row] = np.where(cosine[..., None] > 0.5, detected, np.nan)
     corners = np.repeat(vertices[:, None], 3, axis=1)
     return ImageLandmarks(corners, np.tile([1.0, 0.0, 0.0], (len(vertices), 1)), pixels)
 

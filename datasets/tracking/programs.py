@@ -1,4 +1,8 @@
-"""Trackers of other authors, run in the user's own installation on the file of a video."""
+"""Trackers of other authors, run in the user's own installation on the file of a video.
+
+Requirements of the trackers of other authors on the machine, for ``headbench doctor``. ``headbench track --with``: runs
+another tracker in the user's installation and converts its result to a capture.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +22,8 @@ from ...bench.io.documents import read_json
 from ...bench.io.files import check_output_folder, digest, digest_file, write_json
 from ...bench.process import described, environment, run_program
 from ...bench.specs import CommandResult, Need
+from ..ga.writer import link_or_copy
 from ..head.refit.command import target_head
-from ..head.refit.rewrite import link_or_copy
 from ..monocular.clip import check_subject, subject_of
 from ..tracker_files.command import ImportTrackingSettings, import_tracking
 from ..video.decode import is_video, probe_video
@@ -187,9 +191,7 @@ def check_checkout(name: str, checkout: Path) -> None:
 
 def check_interpreter(name: str, python: str, option: str = "--python") -> Path:
     """Path of an interpreter with the modules of a program. Raises `InputError` if it or one of these is missing.
-
-    ``option`` is the one that names it, for messages.
-    """
+    ``option`` is the one that names it, for messages."""
     program = PROGRAMS[name]
     interpreter = shutil.which(python)
     if interpreter is None:
@@ -200,7 +202,7 @@ def check_interpreter(name: str, python: str, option: str = "--python") -> Path:
     expected = f"the modules {', '.join(program.modules)}"
     with tempfile.TemporaryDirectory() as elsewhere:  # the checkout itself is not importable there
         try:
-            found = subprocess.run(
+            completed = subprocess.run(
                 command,
                 cwd=elsewhere,
                 env=environment(),
@@ -211,8 +213,8 @@ def check_interpreter(name: str, python: str, option: str = "--python") -> Path:
             )
         except subprocess.TimeoutExpired:
             raise InputError(path, "", expected, f"none within {IMPORT_TIMEOUT_S:g} s", remedy) from None
-    if found.returncode:
-        message = found.stderr.strip().splitlines()[-1:] or [described(found.returncode)]
+    if completed.returncode:
+        message = completed.stderr.strip().splitlines()[-1:] or [described(completed.returncode)]
         raise InputError(path, "", expected, message[0], remedy)
     return path
 
@@ -316,11 +318,8 @@ if TYPE_CHECKING:
 
 
 def track_with_program(settings: TrackSettings, progress: Progress) -> CommandResult:
-    """Run another tracker on the file of a video and convert its output to a capture.
-
-    Its files are in a folder of its name in ``settings.out``, the capture beside it. A repeated call resumes after the last
-    finished step.
-    """
+    """Run another tracker on the file of a video and convert its output to a capture. Its files are in a folder of its
+    name in ``settings.out``, the capture beside it. A repeated call resumes after the last finished step."""
     source, name = Path(settings.capture), settings.program
     if not is_video(source):
         raise InputError(source, "", f"the file of a video, for --with {name}", "something else")
@@ -357,5 +356,5 @@ def track_with_program(settings: TrackSettings, progress: Progress) -> CommandRe
         subject=subject,
         held_out_frames=settings.held_out_frames,
     )
-    found = import_tracking(given, progress)
-    return CommandResult(f"{message}\n{found.text}", found.data)
+    imported = import_tracking(given, progress)
+    return CommandResult(f"{message}\n{imported.text}", imported.data)

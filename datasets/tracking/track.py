@@ -1,4 +1,8 @@
-"""Track the head model of a clip in its images."""
+"""Track the head model of a clip in its images.
+
+Replaces the tracking of a run's clips by one estimated from their images; a registered clip transform. Error of tracked
+meshes by region of the head.
+"""
 
 from __future__ import annotations
 
@@ -25,9 +29,8 @@ from ..head.model import PosedSubject
 from ..open import open_clip
 from .fit import Fitter, HeadState
 from .landmarks import ImageLandmarks, landmark_source
-from .rig import PoseColumns, outliers
+from .rig import FrameStack, PoseColumns, Views, outliers
 from .settings import TRACKER_VERSION
-from .views import FrameStack, Views
 
 LID_REACH = 1.25
 """Lids are the skin within this many radii of an eyeball's centre."""
@@ -98,12 +101,12 @@ def mesh_errors(found: FloatArray, wanted: FloatArray, turns: FloatArray) -> Reg
         return 1e3 * float(np.sqrt((gaps**2).sum(axis=-1).mean()))
 
     gaps = found - wanted
-    own = np.einsum("tij,tni->tnj", turns, gaps)
+    local = np.einsum("tij,tni->tnj", turns, gaps)
     mapped = []
     for one, other in zip(found, wanted):
         terms = np.concatenate([one - one.mean(axis=0), np.ones((len(one), 1))], axis=1)
         mapped.append(terms @ np.linalg.lstsq(terms, other, rcond=None)[0] - other)
-    return RegionError(spread(gaps), spread(np.stack(mapped)), spread(own - own.mean(axis=0)))
+    return RegionError(spread(gaps), spread(np.stack(mapped)), spread(local - local.mean(axis=0)))
 
 
 LEAST_TRACKED = 0.5
@@ -214,12 +217,12 @@ def track(
     fits = _Fits(clip, [*cameras], views, store)
     pixels: dict[int, FloatArray] = {}
     for block in range(blocks):
-        landmarks = source(part := timesteps[block::blocks])
-        pixels |= dict(zip(part, landmarks.pixels))
+        landmarks = source(chosen := timesteps[block::blocks])
+        pixels |= dict(zip(chosen, landmarks.pixels))
         if landmarks.seen.any():
-            part = [timestep for timestep, seen in zip(part, landmarks.seen) if seen]
+            chosen = [timestep for timestep, seen in zip(chosen, landmarks.seen) if seen]
             part_progress = partial(_part_progress, progress, block, blocks)
-            fits.fit(f"part-{block:05d}", part, landmarks.of(landmarks.seen), part, part_progress)
+            fits.fit(f"part-{block:05d}", chosen, landmarks.of(landmarks.seen), chosen, part_progress)
     if not fits.poses:
         raise InputError(where, "landmarks", "a face in some image that fits the head model", "none")
     first = fits.outliers()
@@ -231,10 +234,10 @@ def track(
         fits.poses |= {timestep: fits.poses[one] for timestep, one in nearest.items()}
         # Others give the colours of the points.
         others = sorted(good, key=lambda one: min(abs(one - timestep) for timestep in wrong))[:half]
-        part = sorted([*wrong, *others])
-        again = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in part]))
+        refitted = sorted([*wrong, *others])
+        again = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in refitted]))
         part_progress = partial(_part_progress, progress, blocks + number, blocks + len(parts))
-        fits.fit(f"again-{number:05d}", part, again, wrong, part_progress)
+        fits.fit(f"again-{number:05d}", refitted, again, wrong, part_progress)
     last = fits.outliers()
     kept = sorted({*fits.poses} - last)
     report = TrackingReport(
@@ -343,9 +346,7 @@ def _fit_block(
     progress: Progress,
 ) -> dict[str, np.ndarray]:
     """Fit some timesteps with a given or a newly estimated shape, from given poses or from those of the landmarks.
-
-    Returns the arrays of `_PART`.
-    """
+    Returns the arrays of `_PART`."""
     begin = time.perf_counter()
     fitter = Fitter(clip.head, views, landmarks)
     images = [clip.image(clip.frame_at[timestep, name]) for timestep in part for name in cameras]
@@ -394,10 +395,10 @@ def with_tracking(
         with progress(f"tracking {capture.subject}") as report:
             cameras = [*capture.cameras]
             source = landmark_source(capture, cameras, landmarks, teacher, seed)
-            found = track(capture, cameras, source, progress=report).clip
-        timesteps = sorted(found.poses)
-        rows = columns.rows([found.poses[timestep] for timestep in timesteps])
-        save_npz(place, {"shape": np.asarray(found.shape), "poses": rows, "timesteps": np.array(timesteps)})
+            tracked = track(capture, cameras, source, progress=report).clip
+        timesteps = sorted(tracked.poses)
+        rows = columns.rows([tracked.poses[timestep] for timestep in timesteps])
+        save_npz(place, {"shape": np.asarray(tracked.shape), "poses": rows, "timesteps": np.array(timesteps)})
     members = {"shape": Member("f", ("S",), MAX_MAGNITUDE), "poses": Member("f", ("T", "D"), MAX_MAGNITUDE)}
     members["timesteps"] = Member("i", ("T",))
     sizes = {"S": capture.head.shape_basis.shape[2], "D": columns.size}

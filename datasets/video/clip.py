@@ -1,5 +1,7 @@
 """A video file as a clip that is not tracked yet: frames with a face, cropped and masked, and one camera.
 
+Masks of a person by background subtraction of the empty room, for a static camera.
+
 Formats read:
 
 - Masks of the frames of a video. Written by PeterL1n/RobustVideoMatting (`inference_utils.py`). Not checked on a file of
@@ -72,10 +74,8 @@ class Background(NamedTuple):
     """(H, W) minimum difference of foreground, levels."""
 
     def mask(self, image: ByteArray, face: FloatArray) -> HeadMask:
-        """The mask of an (H, W, 3) image of the same view with the landmarks ``face``, (L, 2) pixels.
-
-        It is the connected part of the difference that holds the face, without holes, and ends `BELOW` the chin as crops do.
-        """
+        """The mask of an (H, W, 3) image of the same view with the landmarks ``face``, (L, 2) pixels. It is the
+        connected part of the difference that holds the face, without holes, and ends `BELOW` the chin as crops do."""
         hull = np.zeros(image.shape[:2], np.uint8)
         cv2.fillConvexPoly(hull, cv2.convexHull(np.rint(face).astype(np.int32)), 1)
         inside, bottom = hull.astype(bool), float(face[:, 1].max())
@@ -105,9 +105,7 @@ class Background(NamedTuple):
 
 def learn_background(path: Path, images: Sequence[ByteArray]) -> Background:
     """The median of each pixel over frames that do not show a face, most of which have to show the empty room.
-
-    ``path``: The video, for messages. ``images``: Images (H, W, 3) of one view.
-    """
+    ``path``: The video, for messages. ``images``: Images (H, W, 3) of one view."""
     if len(images) < LEAST_EMPTY:
         expected = f"at least {LEAST_EMPTY} frames that show nobody's face, {_USE}"
         raise InputError(path, "", expected, f"{len(images)}", _REMEDY)
@@ -155,8 +153,8 @@ class SelfieSegmentation:
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
         self._network.set_tensor(self._input["index"], small[None])
         self._network.invoke()
-        found: FloatArray = self._network.get_tensor(self._output["index"])[0, :, :, 0]
-        large = cv2.resize(found, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
+        probability: FloatArray = self._network.get_tensor(self._output["index"])[0, :, :, 0]
+        large = cv2.resize(probability, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
         return np.asarray(np.rint(255 * large.clip(0, 1)), np.uint8)
 
 
@@ -180,10 +178,12 @@ class FrameView(NamedTuple):
 
     def image(self, frame: ByteArray) -> ByteArray:
         """The view of a frame or a mask of its size."""
-        part = self.crop.of(frame)
-        if part.shape[:2] == (self.height, self.width):
-            return part
-        return np.asarray(cv2.resize(part, (self.width, self.height), interpolation=cv2.INTER_AREA), np.uint8)
+        cropped = self.crop.of(frame)
+        if cropped.shape[:2] == (self.height, self.width):
+            return cropped
+        return np.asarray(
+            cv2.resize(cropped, (self.width, self.height), interpolation=cv2.INTER_AREA), np.uint8
+        )
 
     def points(self, pixels: FloatArray) -> FloatArray:
         """(..., 2) pixels of the view from those of a frame."""
@@ -233,12 +233,14 @@ class MaskSource:
         if not self.by_background:
             return
         empty = evenly_with_ends(np.flatnonzero(~faces.found & (faces.others == 0)).tolist(), SAMPLES)
-        shown = evenly_with_ends(np.flatnonzero(faces.found).tolist(), CHECKED)
-        chosen = {*faces.numbers[[*empty, *shown]].tolist()}
+        checked = evenly_with_ends(np.flatnonzero(faces.found).tolist(), CHECKED)
+        chosen = {*faces.numbers[[*empty, *checked]].tolist()}
         images = {frame.number: view.image(frame.image) for frame in frames if frame.number in chosen}
         self._background = learn_background(path, [images[number] for number in faces.numbers[empty]])
-        pixels = view.points(faces.pixels[shown])
-        check_background(path, self._background, [images[number] for number in faces.numbers[shown]], pixels)
+        pixels = view.points(faces.pixels[checked])
+        check_background(
+            path, self._background, [images[number] for number in faces.numbers[checked]], pixels
+        )
 
     def mask(self, frame: TimedFrame, view: FrameView, face: FloatArray) -> ByteArray:
         """(H, W) 8-bit coverage of the person in the view of a frame with landmarks ``face``, (L, 2) pixels of the frame."""
@@ -282,7 +284,7 @@ class VideoClip(NamedTuple):
         return tuple(self.faces.numbers[~self.faces.found].tolist())
 
     def found(self, timestep: int, camera: str, near: FloatArray | None) -> Iterator[FloatArray]:
-        """(L, 2) landmarks of a frame of the clip, pixels of the clip: a `tracking.network.Finder`."""
+        """(L, 2) landmarks of a frame of the clip, pixels of the clip: a `tracking.landmarks.Finder`."""
         yield self.pixels[timestep]
 
     def with_focal(self, focal: float) -> CaptureClip:
@@ -302,18 +304,16 @@ def open_video(
     out: Path,
     progress: Progress = no_progress,
 ) -> VideoClip:
-    """Read a video, write its frames and masks under ``out``, and return them as a clip in a neutral pose.
-
-    Files that an earlier call with the same video and options wrote there are reused.
-    """
+    """Read a video, write its frames and masks under ``out``, and return them as a clip in a neutral pose. Files that
+    an earlier call with the same video and options wrote there are reused."""
     subject = options.subject or subject_of(path)
     check_subject(subject, "--subject")
     info = probe_video(path)
     masks = MaskSource(options)
     mark = digest(TRACKER_VERSION, digest_file(path), finder.digest, options.rate, options.longest)
     faces = find_faces(path, _frames(path, options), finder, out / FACES, mark, progress)
-    shown = faces.numbers[faces.found].tolist()
-    mark = digest(mark, options.size, masks.prepare(shown, info))
+    numbers = faces.numbers[faces.found].tolist()
+    mark = digest(mark, options.size, masks.prepare(numbers, info))
     folder = out / f"{IMAGES}-{mark[:16]}"
     for other in out.glob(f"{IMAGES}-*"):
         if other != folder:
@@ -325,7 +325,7 @@ def open_video(
     K = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
     camera = Camera("0", view.width, view.height, K, np.eye(4))
     frames = []
-    for number in shown:
+    for number in numbers:
         mask = folder / MASKS / f"{number:05d}.png" if masks else None
         image, where = folder / f"{number:05d}.png", (path, f"frame {number}")
         frames.append(VideoFrame(where, VIDEO, number, image, mask, camera, _neutral(head)))
@@ -338,7 +338,7 @@ def open_video(
         use_cache=False,
         progress=progress,
     )
-    unsure = tuple(masks.unsure[number] for number in shown if masks.unsure)
+    unsure = tuple(masks.unsure[number] for number in numbers if masks.unsure)
     return VideoClip(clip, info, view, faces, view.points(faces.pixels[faces.found]), unsure)
 
 

@@ -46,10 +46,8 @@ class OpenedVideo(NamedTuple):
 
 
 def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) -> OpenedVideo:
-    """The clip of a video with its focal length.
-
-    Its frames and results are stored in ``folder``, from which a later call resumes.
-    """
+    """The clip of a video with its focal length. Its frames and results are stored in ``folder``, from which a later
+    call resumes."""
     path = Path(settings.capture)
     named = settings.head or EMBEDDED
     head = target_head(named, "--head")
@@ -72,20 +70,20 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
     )
     clip, focal = video.clip, None
     landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
-    found = landmarks(sorted(clip.poses))
-    if (count := int(found.seen.sum())) < LEAST_SEEN * len(found.seen):
+    detected = landmarks(sorted(clip.poses))
+    if (count := int(detected.seen.sum())) < LEAST_SEEN * len(detected.seen):
         expected = f"a face whose landmarks fit the head model in at least {LEAST_SEEN:.0%} of the frames"
-        raise InputError(path, "", expected, f"it in {count} of {len(found.seen)}", REMEDY)
+        raise InputError(path, "", expected, f"it in {count} of {len(detected.seen)}", REMEDY)
     if settings.focal is None:
         (camera,) = clip.cameras.values()
         side = max(video.info.width, video.info.height) * video.view.scale
         stored = cached_arrays(
             folder / "focal.npz",
-            digest(mark, camera.K, side, found.pixels),
+            digest(mark, camera.K, side, detected.pixels),
             _FOCAL,
             lambda: {
                 name: np.asarray(value)
-                for name, value in estimate_focal(clip.head, camera, found, side)._asdict().items()
+                for name, value in estimate_focal(clip.head, camera, detected, side)._asdict().items()
             },
         )
         focal = FocalLength(float(stored["pixels"]), stored["residuals"], stored["tried"])
@@ -166,5 +164,5 @@ def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
 
 def listed(numbers: Sequence[int]) -> str:
     """How many frames, and which."""
-    shown = ", ".join(map(str, numbers[:8])) + (" ..." if len(numbers) > 8 else "")
-    return f"{counted(len(numbers), 'frame')} ({shown})"
+    text = ", ".join(map(str, numbers[:8])) + (" ..." if len(numbers) > 8 else "")
+    return f"{counted(len(numbers), 'frame')} ({text})"

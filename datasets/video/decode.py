@@ -154,8 +154,8 @@ def _picture(path: Path, frame: Any, ratio: float) -> ByteArray:
 
 def _upright(path: Path, frame: Any, image: ByteArray) -> ByteArray:
     """The image turned and mirrored by the frame's display matrix, ISO 14496-12, 8.3.2."""
-    found = [bytes(data) for data in frame.side_data if data.type.name == "DISPLAYMATRIX"]
-    matrix = np.frombuffer(found[0], np.int32).reshape(3, 3)[:2, :2] / 65536 if found else np.eye(2)
+    matrices = [bytes(data) for data in frame.side_data if data.type.name == "DISPLAYMATRIX"]
+    matrix = np.frombuffer(matrices[0], np.int32).reshape(3, 3)[:2, :2] / 65536 if matrices else np.eye(2)
     turn = np.rint(matrix)
     if np.abs(matrix - turn).max() > 0.01 or (np.abs(turn).sum(axis=0) != 1).any():
         remedy = "ffmpeg -i IN OUT.mp4"

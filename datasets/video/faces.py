@@ -1,4 +1,12 @@
-"""Localisation of one person's head in the frames of a video."""
+"""Localisation of one person's head in the frames of a video.
+
+Boxes of faces by MediaPipe's face detector, whose file is read without the package mediapipe.
+
+Formats read:
+
+- MediaPipe's face detector. Written by google-ai-edge/mediapipe 0.10.21. Checked on its wheel,
+  `mediapipe/modules/face_detection/face_detection_full_range_sparse.tflite`.
+"""
 
 from __future__ import annotations
 
@@ -57,21 +65,21 @@ class FaceDetector:
 
     def detect(self, image: ByteArray) -> list[FaceCrop]:
         """Crops for a network of landmarks of the faces in an (H, W, 3) 8-bit RGB image, the highest score first."""
-        found = []
+        detections = []
         longer = max(image.shape[:2])
         for scale in (side / longer for side in SCALES if side <= max(longer, SIDE)):
             size = [max(1, round(scale * side)) for side in image.shape[1::-1]]
             small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
             for left, top in product(*map(_starts, size)):
                 square = np.zeros((SIDE, SIDE, 3), np.uint8)
-                part = small[max(0, top) : top + SIDE, max(0, left) : left + SIDE]
-                square[max(0, -top) :, max(0, -left) :][: len(part), : part.shape[1]] = part
+                tile = small[max(0, top) : top + SIDE, max(0, left) : left + SIDE]
+                square[max(0, -top) :, max(0, -left) :][: len(tile), : tile.shape[1]] = tile
                 scores, points = self._run(square)
-                found += [
+                detections += [
                     np.concatenate([[score], (one + [left, top]).ravel() / scale])
                     for score, one in zip(scores, points)
                 ]
-        return [_crop(one) for one in _merged(found)]
+        return [_crop(one) for one in _merged(detections)]
 
     def _run(self, square: ByteArray) -> tuple[FloatArray, FloatArray]:
         """Scores (N,) and points (N, 4, 2), two corners and both eyes, of a square of `SIDE` pixels, values from -1 to 1."""
@@ -127,10 +135,8 @@ def _overlap(first: FloatArray, second: FloatArray) -> float:
 
 
 class FaceFinder:
-    """The landmark network in a file, and the detector in the file beside it or else the one that was fetched.
-
-    Raises as both.
-    """
+    """The landmark network in a file, and the detector in the file beside it or else the one that was fetched. Raises
+    as both."""
 
     def __init__(self, landmarks: Path):
         beside, fetched = (
@@ -149,10 +155,10 @@ class FaceFinder:
         """(COUNT, 2) landmarks of every face of an (H, W, 3) image, the largest first."""
         faces: list[FloatArray] = []
         for crop in self.detector.detect(image):
-            found = self.network.find_in(image, crop)
+            face = self.network.find_in(image, crop)
             # A part of a face that looks like one has a lower score.
-            if found is not None and all(face_distance(found, other) > 1 for other in faces):
-                faces.append(found)
+            if face is not None and all(face_distance(face, other) > 1 for other in faces):
+                faces.append(face)
         return sorted(faces, key=face_size, reverse=True)
 
 
@@ -248,10 +254,8 @@ class FaceFollower:
     """(COUNT, 2) landmarks of every other face of the latest frame."""
 
     def follow(self, image: ByteArray, time: float, search: bool) -> FloatArray | None:
-        """The person's landmarks in the next frame, (COUNT, 2) pixels, or None.
-
-        ``time``: Of the frame, seconds. ``search``: Whether to search for further faces even if the person's is found.
-        """
+        """The person's landmarks in the next frame, (COUNT, 2) pixels, or None. ``time``: Of the frame, seconds.
+        ``search``: Whether to search for further faces even if the person's is found."""
         own = None if self.lost or self.last is None else self._near(image, self.last)
         others: list[FloatArray] = []
         for before in self.others:
@@ -279,8 +283,8 @@ class FaceFollower:
         return own
 
     def _near(self, image: ByteArray, before: FloatArray) -> FloatArray | None:
-        found = self.finder.follow(image, before)
-        return None if found is None else np.asarray(found, np.float32)
+        face = self.finder.follow(image, before)
+        return None if face is None else np.asarray(face, np.float32)
 
     def _own(self, new: Sequence[FloatArray], time: float) -> FloatArray | None:
         """The person's face among those that were not followed, the largest first; None if each is too far away."""

@@ -25,7 +25,7 @@ import torch
 from ...bench.contracts import Clip, FloatArray, FrameKey, HeadPose, IntArray
 from ...bench.protocol import evenly_with_ends
 from ...datasets.head.geometry import rigid_alignment, triangle_areas
-from ...datasets.tracking.views import FrameStack, Occlusion, Views
+from ...datasets.tracking.rig import FrameStack, Occlusion, Views
 from .config import Capacity
 from .surface_points import SubjectMesh
 

@@ -147,7 +147,7 @@ def test_formats_state_writer_and_check(reference):
     rows = re.findall(r"^\| (.+) \| (.+) \| (.+) \| `(.+)` \|$", reference["formats"], re.MULTILINE)
     checked = [row for row in rows if row[2] != "**not checked**"]
     assert f"{len(checked)} of {len(rows)} formats were checked" in reference["formats"]
-    for name in ("loaders", "drive/formats", "drive/blendshapes", "import_ga", *READ_PACKAGES):
+    for name in ("loaders", "drive/formats", "drive/signal", "import_ga", *READ_PACKAGES):
         assert any(name in row[3] for row in rows), name
     for _, _, check, _ in checked:
         assert re.search(r"\w+/[\w.-]+@[0-9a-f]{8}\b|(wheel|package).*`?[\w./]+", check), check

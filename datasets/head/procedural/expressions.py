@@ -180,10 +180,8 @@ def semantic_shapes(surface: SculptedHead) -> dict[str, FloatArray]:
 
 @dataclass(frozen=True, eq=False)
 class ExpressionBasis:
-    """A version's expression directions (V, 3, E) and the matrix (K, E) from its shapes' activations to them.
-
-    ``names`` are the K shapes of the basis, E at most K; a version with eyelid bases has the blinks in these.
-    """
+    """A version's expression directions (V, 3, E) and the matrix (K, E) from its shapes' activations to them. ``names``
+    are the K shapes of the basis, E at most K; a version with eyelid bases has the blinks in these."""
 
     directions: FloatArray
     names: tuple[str, ...]

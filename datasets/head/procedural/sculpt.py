@@ -202,10 +202,7 @@ def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
 
 def surface_graph(vertices: FloatArray, faces: IntArray, size: FloatArray, *, diagonals: bool) -> csr_matrix:
     """Edges of the mesh, optionally with the short diagonals across them, weighted by length relative to the target
-    length.
-
-    Diagonals make distances more even in all directions, but let one cluster leap over another.
-    """
+    length. Diagonals make distances more even in all directions, but let one cluster leap over another."""
     edges = mesh_edges(faces)
     opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
     key = np.sort(edges, axis=1)
@@ -225,8 +222,8 @@ def initial_seeds(vertices: FloatArray, density: FloatArray, count: int) -> IntA
     code = np.zeros(len(vertices), np.uint64)
     for bit in range(9):
         for axis in range(3):
-            part = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
-            code |= part << np.uint64(3 * bit + axis)
+            bits = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
+            code |= bits << np.uint64(3 * bit + axis)
     order = np.argsort(code, kind="stable")
     share = np.cumsum(density[order])
     return order[np.unique(np.searchsorted(share, (np.arange(count) + 0.5) * share[-1] / count))]

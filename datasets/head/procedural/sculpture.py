@@ -2,6 +2,10 @@
 
 Every function works on points ``(N, 3)`` in metres and returns ``(N,)`` approximate signed distances,
 negative inside. The bounds are those of I. Quilez, "Distance functions" and "Smooth minimum".
+
+Anatomy of the sculpted head: positions, curves and frames shared by the sculptor and the rig. Metres, +y up, +z front,
+subject's left at +x. Every curve is given for the left half; the right one is its mirror image. Proportions follow
+adult means of Farkas, "Anthropometry of the Head and Face" (1994).
 """
 
 from __future__ import annotations
@@ -40,10 +44,8 @@ def canthal_height(x: FloatArray | float) -> FloatArray | float:
 
 
 def lid_curves(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Heights of the upper and lower lid margin above the centre of the eye, at ``x`` from the centre.
-
-    The curves cross at the canthi, so that the aperture closes.
-    """
+    """Heights of the upper and lower lid margin above the centre of the eye, at ``x`` from the centre. The curves cross
+    at the canthi, so that the aperture closes."""
     middle = (MEDIAL_CANTHUS + LATERAL_CANTHUS) / 2
     half = (LATERAL_CANTHUS - MEDIAL_CANTHUS) / 2
     u = (x - middle) / half

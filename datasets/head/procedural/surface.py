@@ -187,11 +187,8 @@ def skinning_weights(surface: SculptedHead) -> FloatArray:
 
 
 def joint_regressor(surface: SculptedHead) -> FloatArray:
-    """(5, V) joint regressor, rows sum to 1, that gives `JOINTS` at rest.
-
-    Each row is the most even weighting of vertices around its joint that reproduces it exactly; an eye's joint is the
-    mean of its ball.
-    """
+    """(5, V) joint regressor, rows sum to 1, that gives `JOINTS` at rest. Each row is the most even weighting of
+    vertices around its joint that reproduces it exactly; an eye's joint is the mean of its ball."""
     vertices = surface.vertices
     _x, y, z = vertices.T
     supports = {
@@ -211,9 +208,7 @@ def joint_regressor(surface: SculptedHead) -> FloatArray:
 
 def pose_basis(surface: SculptedHead) -> FloatArray:
     """(V, 3, 36) correctives: when the jaw opens, the cheeks become hollow and the corners of the mouth move inwards.
-
-    They follow the sine of the opening angle, from the entries (2, 1) and (1, 2) of the jaw's R - I.
-    """
+    They follow the sine of the opening angle, from the entries (2, 1) and (1, 2) of the jaw's R - I."""
     x, y, z = surface.vertices.T
     basis = np.zeros((len(surface.vertices), 3, 9 * (len(PARENTS) - 1)))
     side = np.tanh(x / 0.010)

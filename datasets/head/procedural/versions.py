@@ -1,4 +1,7 @@
-"""Versions of the default head, and the coefficients of its named shapes in each."""
+"""Versions of the default head, and the coefficients of its named shapes in each.
+
+Names of the expressions of head models.
+"""
 
 from __future__ import annotations
 
@@ -103,26 +106,26 @@ def named_expressions(version: str, names: Sequence[str], size: int) -> list[Exp
 
 
 def _procedural(rows: Mapping[str, FloatArray]) -> list[Expression]:
-    found = [_one_sided(name, rows[f"{name}_left"] + rows[f"{name}_right"]) for name in PAIRED]
-    found += [_one_sided(name, rows[name]) for name in SINGLE]
-    found += [
+    expressions = [_one_sided(name, rows[f"{name}_left"] + rows[f"{name}_right"]) for name in PAIRED]
+    expressions += [_one_sided(name, rows[name]) for name in SINGLE]
+    expressions += [
         Expression(f"{name} sideways", rows[f"{name}_left"] - rows[f"{name}_right"], -1.0, 1.0)
         for name in SIDEWAYS
     ]
-    return [shape for shape in found if shape.direction.any()]
+    return [shape for shape in expressions if shape.direction.any()]
 
 
 def _paired(columns: Mapping[str, FloatArray]) -> list[Expression]:
-    found: dict[str, Expression] = {}
+    expressions: dict[str, Expression] = {}
     for name, column in columns.items():
         both = [(left, right) for left, right in SIDES if name.endswith((left, right))]
         stem = name.removesuffix(both[0][0]).removesuffix(both[0][1]) if both else name
         pair = [stem + side for side in both[0]] if both else []
         if pair and all(side in columns for side in pair):
-            found[stem] = _one_sided(stem, columns[pair[0]] + columns[pair[1]])
+            expressions[stem] = _one_sided(stem, columns[pair[0]] + columns[pair[1]])
         else:
-            found[name] = _one_sided(name, column)
-    return list(found.values())
+            expressions[name] = _one_sided(name, column)
+    return list(expressions.values())
 
 
 def _one_sided(name: str, direction: FloatArray) -> Expression:

@@ -2,22 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+import tyro
 
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import InputError
 from ....bench.io.files import write_json
 from ....bench.specs import CommandResult, command
+from ...options import CaptureOptions
 from ..arrays import HeadArrays
-from .settings import RefitCommandSettings
+from .settings import RefitSettings
 
 if TYPE_CHECKING:
     from ...clip import CaptureClip
     from .refit import RefitReport
+
+
+@dataclass(frozen=True)
+class RefitCommandSettings(CaptureOptions):
+    """Settings of ``headbench prepare refit``."""
+
+    capture: Annotated[str, tyro.conf.Positional]
+    """Capture, in a layout that a reader knows."""
+
+    target: str
+    """Head model to refit to: 2020 or 2023 (the embedded procedural heads), or the file of a head model."""
+
+    out: str
+    """Folder for the refitted capture, refit.json and heat_map.png."""
+
+    settings: RefitSettings = field(default_factory=RefitSettings)
+    """How to fit."""
 
 
 BLOCKS_FOLDER = "refit-blocks"
@@ -33,9 +52,10 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
     ``heat_map.png``.
     """
     from ...clip import check_apart
+    from ...ga.writer import capture_plan, write_capture
     from ...images import write_image
-    from .refit import draw_heat_map, refit
-    from .rewrite import capture_plan, write_capture
+    from ...inspect.figure import draw_heat_map
+    from .refit import refit
 
     out = Path(settings.out)
     target = target_head(settings.target)

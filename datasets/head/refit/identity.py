@@ -124,8 +124,8 @@ def _first_alignment(source: HeadAsset, neutral: FloatArray, target: HeadAsset) 
         expected = f"at least three of the regions {', '.join(_LANDMARK_REGIONS)} in both models"
         raise InputError(f"head model {source.version!r}", "regions", expected, ", ".join(names) or "none")
     here = np.array([neutral[source.regions[name]].mean(axis=0) for name in names])
-    there = np.array([target.template[target.regions[name]].mean(axis=0) for name in names])
-    return rigid_alignment(here, there)
+    centres = np.array([target.template[target.regions[name]].mean(axis=0) for name in names])
+    return rigid_alignment(here, centres)
 
 
 def _counterparts(
@@ -143,10 +143,10 @@ def _counterparts(
         if not len(rows) or name not in source.regions:
             continue
         faces = source.faces[faces_in_region(source, name)]
-        found = closest_points(fitted[vertices[rows]], aligned, faces)
-        whole = whole + found.matrix(faces, len(aligned), rows, len(vertices))
+        closest = closest_points(fitted[vertices[rows]], aligned, faces)
+        whole = whole + closest.matrix(faces, len(aligned), rows, len(vertices))
         facing = np.einsum("ni,ni->n", normals[vertices[rows]], (whole @ source_normals)[rows])
-        kept[rows] = (found.distance < FARTHEST) & (facing > _FACING)
+        kept[rows] = (closest.distance < FARTHEST) & (facing > _FACING)
     return csr_array(whole), kept
 
 
@@ -180,13 +180,13 @@ def closest_points(points: FloatArray, vertices: FloatArray, faces: IntArray) ->
     centres = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
     size = np.floor(np.log2(np.maximum(radii, 1e-3 * radii.max() + np.finfo(float).tiny))).astype(np.int64)
-    found = ClosestPoints(
+    closest = ClosestPoints(
         np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3)), np.full(len(points), np.inf)
     )
     for alike in np.unique(size)[::-1]:
         members = np.flatnonzero(size == alike)
-        _search(points, corners[members], centres[members], float(radii[members].max()), members, found)
-    return found
+        _search(points, corners[members], centres[members], float(radii[members].max()), members, closest)
+    return closest
 
 
 def _search(
@@ -225,10 +225,8 @@ def _search(
 
 
 def _on_triangles(points: FloatArray, corners: FloatArray) -> FloatArray:
-    """(..., 3) barycentric weights of the points of triangles (..., 3, 3) closest to points (..., 3).
-
-    This is the foot in the plane if it is inside, else the nearest of the closest points on the three edges.
-    """
+    """(..., 3) barycentric weights of the points of triangles (..., 3, 3) closest to points (..., 3). This is the foot
+    in the plane if it is inside, else the nearest of the closest points on the three edges."""
     a, b, c = np.moveaxis(corners, -2, 0)
     ab, ac, ap = b - a, c - a, points - a
     aa, cc, cross = (ab * ab).sum(-1), (ac * ac).sum(-1), (ab * ac).sum(-1)

@@ -116,18 +116,15 @@ class FitProblem:
         self._terms = self._gram_terms()
 
     def frames(self, targets: FloatArray, necks: FloatArray) -> list[FrameTerms]:
-        """Reduce the targets of T timesteps.
-
-        ``targets``: (T, n, 3) metres, in the frame of the head. ``necks``: (T, 3, 3) rotations of the neck joint; used only if
-        the settings keep them.
-        """
+        """Reduce the targets of T timesteps. ``targets``: (T, n, 3) metres, in the frame of the head. ``necks``: (T, 3,
+        3) rotations of the neck joint; used only if the settings keep them."""
         wanted = _MILLIMETRES * np.asarray(targets, dtype=np.float64)
         weighted = wanted * self._share[:, None]
         count, size = len(wanted), self._plain.shape[2]
         products = [(weighted.reshape(count, -1) @ self._plain.reshape(-1, size))[:, None]]
         for rows, turned in self._turned:
-            part = weighted[:, rows].transpose(0, 2, 1).reshape(3 * count, -1)
-            block = part @ turned.reshape(len(rows), -1)  # row: target's component; columns: (c, N)
+            rows_of_head = weighted[:, rows].transpose(0, 2, 1).reshape(3 * count, -1)
+            block = rows_of_head @ turned.reshape(len(rows), -1)  # row: target's component; columns: (c, N)
             products.append(block.reshape(count, 9, size))
         stacked = np.concatenate(products, axis=1)
         squares = np.einsum("tni,tni->t", weighted, wanted)
@@ -164,8 +161,8 @@ class FitProblem:
         spread = side_by_side @ (by_double + by_double.T)
         by_matrix = {joint: np.zeros((3, 3)) for joint in range(len(JOINT_NAMES))}
         for index, joint in enumerate(self._turning):
-            own = by_entry[9 * index : 9 * index + 9].reshape(3, 3)
-            by_matrix[joint] = own + spread[:, 3 * index : 3 * index + 3]
+            derivative = by_entry[9 * index : 9 * index + 9].reshape(3, 3)
+            by_matrix[joint] = derivative + spread[:, 3 * index : 3 * index + 3]
         corner = np.tril(gram[split:, split:]) + np.tril(gram[split:, split:], -1).T
         by_fixed = 2 * (gram[split:, :split] @ free + corner @ fixed - product[split:])
         for (joint, entry), slope in zip(self._correctives, by_fixed):
@@ -180,10 +177,8 @@ class FitProblem:
         return self._skinned(frame, bends, np.concatenate([coefficients, self._fixed(frame, bends)]))
 
     def directions(self, frame: FrameTerms, angles: FloatArray) -> FloatArray:
-        """(n, 3, E + L) derivatives of the fitted vertices by the coefficients at angles (9,), metres.
-
-        This is the dense matrix that `evaluate` avoids, for checks and for solvers that need it.
-        """
+        """(n, 3, E + L) derivatives of the fitted vertices by the coefficients at angles (9,), metres. This is the
+        dense matrix that `evaluate` avoids, for checks and for solvers that need it."""
         bends = matrices_and_derivatives(angles.reshape(-1, 3))[0] - np.eye(3)
         size = self._plain.shape[2]
         return self._skinned(frame, bends, np.eye(size)[:, : self._free_size])
@@ -344,11 +339,8 @@ def angle_bounds(settings: RefitSettings) -> FloatArray:
 def solve_frame(
     problem: FitProblem, frame: FrameTerms, start: FloatArray, fixed: FloatArray, settings: RefitSettings
 ) -> Solution:
-    """Fit one timestep.
-
-    ``start``: (9,) initial angles, such as the previous timestep's. ``fixed``: (9,) values of the angles that move no
-    vertex with a target, which are not optimised.
-    """
+    """Fit one timestep. ``start``: (9,) initial angles, such as the previous timestep's. ``fixed``: (9,) values of the
+    angles that move no vertex with a target, which are not optimised."""
     searched, limit = problem.searched, angle_bounds(settings)
     scale = problem.scale[searched]
     best: list[Solution] = []
@@ -359,12 +351,12 @@ def solve_frame(
         count += 1
         angles = np.where(searched, 0.0, fixed)
         angles[searched] = values * scale
-        found = problem.evaluate(frame, angles)
+        evaluation = problem.evaluate(frame, angles)
         if gradient.size:
-            gradient[:] = found.gradient[searched] * scale
-        if not best or found.value < best[0].value:
-            best[:] = [Solution(found.coefficients, angles, found.value, count)]
-        return found.value
+            gradient[:] = evaluation.gradient[searched] * scale
+        if not best or evaluation.value < best[0].value:
+            best[:] = [Solution(evaluation.coefficients, angles, evaluation.value, count)]
+        return evaluation.value
 
     first = np.clip(start, -limit, limit)[searched] / scale
     if not searched.any():

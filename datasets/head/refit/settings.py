@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
-from typing import Annotated, Literal
-
-import tyro
+from dataclasses import asdict, dataclass
+from typing import Literal
 
 from ....bench.errors import InputError
-from ...options import CaptureOptions
 
 Algorithm = Literal["slsqp", "lbfgs", "mma"]
 
@@ -67,20 +64,3 @@ class RefitSettings:
             lowest = 0.0 if name in ("eyeballs", "lips", "eye_region") else 1e-12
             if not lowest <= value < float("inf"):
                 raise InputError("refit settings", name, f"a number of at least {lowest:g}", str(value))
-
-
-@dataclass(frozen=True)
-class RefitCommandSettings(CaptureOptions):
-    """Settings of ``headbench prepare refit``."""
-
-    capture: Annotated[str, tyro.conf.Positional]
-    """Capture, in a layout that a reader knows."""
-
-    target: str
-    """Head model to refit to: 2020 or 2023 (the embedded procedural heads), or the file of a head model."""
-
-    out: str
-    """Folder for the refitted capture, refit.json and heat_map.png."""
-
-    settings: RefitSettings = field(default_factory=RefitSettings)
-    """How to fit."""

@@ -44,9 +44,9 @@ def submission_write(
     from .submission import TRACKS, after_encoding, decibels, find_frames, write_submission
 
     task, out = TRACKS[track], Path(zip)
-    found = find_frames(Path(frames), task, method, None if data is None else Path(data))
+    files = find_frames(Path(frames), task, method, None if data is None else Path(data))
     try:
-        encoded = write_submission(found, task, out, progress)
+        encoded = write_submission(files, task, out, progress)
     except UnavailableError as error:
         return CommandResult(str(error), {"error": str(error)}, False, ExitCode.NO_VERDICT)
     lines = [f"{'video':<56}{'frames':>7}{'MB':>8}{'dB to frames':>14}"]

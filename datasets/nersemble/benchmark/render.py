@@ -67,10 +67,8 @@ class BenchmarkSequence:
 def read_sequence(
     data: Path, track: BenchmarkTrack, participant: str, sequence: str, head: HeadArrays
 ) -> BenchmarkSequence:
-    """Read cameras and tracking of a sequence from the benchmark's folder.
-
-    ``head``: FLAME 2023 with or without teeth; coefficients are padded with zeros to its bases.
-    """
+    """Read cameras and tracking of a sequence from the benchmark's folder. ``head``: FLAME 2023 with or without teeth;
+    coefficients are padded with zeros to its bases."""
     path = tracking_file(data, participant, sequence)
     arrays = read_arrays(path, MEMBERS)
     for name, values in arrays.items():
@@ -154,10 +152,14 @@ def render_participant(settings: SubmissionRenderSettings, progress: Progress = 
         found = f"{method.spec.name}, which works at another"
         raise InputError(folder / AVATAR_FILE, "resolution", expected, found, "Train it with another preset.")
     for name, sequence in sequences.items():
-        shown = stored.shows_another(settings.participant, sequence.shape, head.version)
-        if shown:
+        mismatch = stored.shows_another(settings.participant, sequence.shape, head.version)
+        if mismatch:
             log.warning(
-                "%s shows %s, with another shape than %s has in %s", folder, shown, settings.participant, name
+                "%s shows %s, with another shape than %s has in %s",
+                folder,
+                mismatch,
+                settings.participant,
+                name,
             )
     avatar = stored.load(settings.device)
     home = Path(settings.out) / settings.participant

@@ -1,4 +1,13 @@
-"""Submissions to the NeRSemble benchmark: writing a zip of videos from frames, and checking it like the server does."""
+"""Submissions to the NeRSemble benchmark: writing a zip of videos from frames, and checking it like the server does.
+
+Videos that the NeRSemble benchmark requests: participants, sequences, size, rate and length. Source: the documentation
+and constants of nersemble-benchmark (commit e15f204, 2026-04).
+
+Formats read:
+
+- FLAME tracking of the NeRSemble benchmark. Written by the authors of tobias-kirschstein/nersemble-benchmark@e15f204d,
+  whose `src/nersemble_benchmark/data/benchmark_data.py` it follows. Not checked on a file of the program.
+"""
 
 from __future__ import annotations
 
@@ -60,10 +69,8 @@ class BenchmarkTrack:
     """Published number of frames of all sequences of a participant together."""
 
     def videos(self, data: Path | None = None) -> Iterator[Video]:
-        """All videos of a submission.
-
-        ``data`` is the benchmark's folder; its tracking gives the number of frames if that is not published.
-        """
+        """All videos of a submission. ``data`` is the benchmark's folder; its tracking gives the number of frames if
+        that is not published."""
         for participant, sequences in self.sequences.items():
             for sequence, frames in sequences.items():
                 count = frames
@@ -150,7 +157,7 @@ def find_frames(
     ``method``: Method to use from a run with several. ``data``: The benchmark's folder, which gives the number of frames of
     a sequence if that is not published.
     """
-    found: dict[Video, list[Path]] = {}
+    files: dict[Video, list[Path]] = {}
     by_participant = {name: _by_camera(folder, name, method) for name in track.sequences}
     lacking = []
     for video in track.videos(data):
@@ -167,20 +174,20 @@ def find_frames(
         if numbers[-1] - numbers[0] + 1 != len(numbers):
             gap = next(b for a, b in pairwise(numbers) if b != a + 1) - 1
             raise InputError(where, key, "timesteps without a gap", f"none of timestep {gap}")
-        found[video] = [frames[number] for number in numbers]
+        files[video] = [frames[number] for number in numbers]
     if lacking:
-        expected = f"frames of {len(found) + len(lacking)} videos, such as {lacking[0]}"
+        expected = f"frames of {len(files) + len(lacking)} videos, such as {lacking[0]}"
         remedy = "Frames are PARTICIPANT/SEQUENCE_TIMESTEP_SERIAL.png, as `headbench submission render` writes them."
         raise InputError(folder, "", expected, f"none for {len(lacking)} of them", remedy)
-    _check_lengths(folder, track, {video: len(frames) for video, frames in found.items()})
-    for paths in found.values():
+    _check_lengths(folder, track, {video: len(frames) for video, frames in files.items()})
+    for paths in files.values():
         for path in paths:
             info = probe_image(path)
             if (info.width, info.height) != track.size or info.channels != 3:
                 size = "x".join(map(str, track.size))
                 expected = f"RGB of {size} pixels, the size of this track"
                 raise InputError(path, "", expected, f"{info.width}x{info.height}, {info.channels} channels")
-    return found
+    return files
 
 
 def _by_camera(folder: Path, participant: str, method: str) -> dict[tuple[str, str], dict[int, Path]]:
@@ -197,13 +204,13 @@ def _by_camera(folder: Path, participant: str, method: str) -> dict[tuple[str, s
             )
             raise InputError(home, "--method", expected, names)
         places = sorted(path for path in chosen[0].iterdir() if path.is_dir())
-    found: dict[tuple[str, str], dict[int, Path]] = {}
+    files: dict[tuple[str, str], dict[int, Path]] = {}
     for place in places:
         for path in sorted(place.iterdir()) if place.is_dir() else ():
             if match := _FRAME.fullmatch(path.name):
-                of = found.setdefault((match["sequence"], match["camera"]), {})
+                of = files.setdefault((match["sequence"], match["camera"]), {})
                 of[int(match["timestep"])] = path
-    return found
+    return files
 
 
 def _check_lengths(where: Path, track: BenchmarkTrack, counts: dict[Video, int]) -> None:
@@ -218,11 +225,11 @@ def _check_lengths(where: Path, track: BenchmarkTrack, counts: dict[Video, int])
                 where, f"{participant}, {sequence}", expected, ", ".join(map(str, sorted(lengths)))
             )
     for participant, total in (track.totals or {}).items():
-        own = sum(max(lengths) for (name, _), lengths in by_sequence.items() if name == participant)
-        if own != total:
+        frames = sum(max(lengths) for (name, _), lengths in by_sequence.items() if name == participant)
+        if frames != total:
             expected = f"{total} frames in all sequences together, as published"
             remedy = "Render every frame of every test sequence."
-            raise InputError(where, participant, expected, f"{own}", remedy)
+            raise InputError(where, participant, expected, f"{frames}", remedy)
 
 
 # Writing

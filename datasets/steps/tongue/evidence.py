@@ -7,6 +7,8 @@ blush, pallor, wrinkles, shadows and an open mouth do not change that ratio of s
 
 Every comparison is with the subject's canonical map (the median over timesteps), camera by camera, and tolerates
 tracking errors: a pixel counts only if no pixel within `FORGIVEN` of its position looks similar.
+
+A contact sheet for review: mouths by score, with outlines of covered areas and the decision as a frame.
 """
 
 from __future__ import annotations
@@ -21,8 +23,8 @@ from scipy import ndimage
 
 from ....bench.contracts import ByteArray, Camera, Clip, FloatArray
 from ....bench.io.figures import pixels
-from ...figures import new_figure, shortened, show
 from ...images import srgb_to_linear, write_image
+from ...inspect.figure import new_figure, shortened, show
 from ..exclude import Exclusions, FrameDecision
 from .mouth import PITCH, MouthAtlas, MouthColours, frames_by_timestep, posed_meshes
 
@@ -81,10 +83,8 @@ def find_evidence(colours: MouthColours, atlas: MouthAtlas) -> MouthEvidence:
 
 
 def mouth_patch(strength: FloatArray, atlas: MouthAtlas) -> np.ndarray:
-    """(H, W) the largest connected patch of covered pixels that begins at the mouth's opening.
-
-    The region between the patch and the opening belongs to it, since a tongue comes out of the mouth.
-    """
+    """(H, W) the largest connected patch of covered pixels that begins at the mouth's opening. The region between the
+    patch and the opening belongs to it, since a tongue comes out of the mouth."""
     labels, count = ndimage.label((strength > LOOKS) & atlas.below, np.ones((3, 3)))
     opening = atlas.below & (atlas.height > -CONNECTED) & (atlas.lips & atlas.below).any(axis=0)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
@@ -101,12 +101,12 @@ def _camera_strength(
     colours: ByteArray, seen: np.ndarray, atlas: MouthAtlas
 ) -> tuple[FloatArray, np.ndarray]:
     """(T, H, W) standard deviations by which each pixel looks covered to one camera, and whether it is visible."""
-    known = seen & (seen.mean(axis=0) > _LEAST_SEEN)
-    rows = known.any(axis=(1, 2))
-    strength = np.zeros(known.shape, np.float32)
+    measured = seen & (seen.mean(axis=0) > _LEAST_SEEN)
+    rows = measured.any(axis=(1, 2))
+    strength = np.zeros(measured.shape, np.float32)
     if rows.any():
-        strength[rows] = _strength(_features(colours[rows], seen[rows]), known[rows])
-    return strength, known
+        strength[rows] = _strength(_features(colours[rows], seen[rows]), measured[rows])
+    return strength, measured
 
 
 def _strength(values: dict[str, FloatArray], known: np.ndarray) -> FloatArray:
@@ -130,8 +130,8 @@ def _strength(values: dict[str, FloatArray], known: np.ndarray) -> FloatArray:
     not_dark = values["light"] > lowest["light"] - _DARKER
     lost = lowest["pink"] - values["pink"] > PIGMENT_LOST * np.maximum(lowest["pink"], _LEAST_PIGMENT)
     strength = np.where(lost & not_pale & not_dark, strength, np.minimum(strength, 0))
-    found: FloatArray = np.where(known, strength, 0).astype(np.float32)
-    return found
+    covered: FloatArray = np.where(known, strength, 0).astype(np.float32)
+    return covered
 
 
 def _features(colours: ByteArray, seen: np.ndarray) -> dict[str, FloatArray]:
@@ -178,11 +178,8 @@ def decide(
     threshold: float | None,
     overrides: Mapping[int, str],
 ) -> Exclusions:
-    """Decide every timestep.
-
-    ``timesteps``: Sequence by timestep, in the order of the evidence. ``threshold``: mm²; None chooses one automatically.
-    ``overrides``: Manual decisions, see `Exclusions`.
-    """
+    """Decide every timestep. ``timesteps``: Sequence by timestep, in the order of the evidence. ``threshold``: mm²;
+    None chooses one automatically. ``overrides``: Manual decisions, see `Exclusions`."""
     basis = "given"
     if threshold is None:
         threshold, basis = choose_threshold(evidence.areas)
@@ -229,23 +226,23 @@ def write_sheet(
     # Among equal scores, mostly zeros, prefer those next to an excluded frame, where the tongue appears and disappears.
     away = [min((abs(t - other) for other in reasons), default=0) for t in timesteps]
     order = sorted(range(len(timesteps)), key=lambda row: (-float(evidence.areas[row]), away[row]))
-    shown = order[:count] + [row for row in order[count:] if timesteps[row] in decided.overrides]
-    place = {timesteps[row]: number for number, row in enumerate(shown)}
+    displayed = order[:count] + [row for row in order[count:] if timesteps[row] in decided.overrides]
+    place = {timesteps[row]: number for number, row in enumerate(displayed)}
     frames = frames_by_timestep(clip)
-    columns = min(COLUMNS, max(len(shown), 4))
-    rows = -(-len(shown) // columns)
+    columns = min(COLUMNS, max(len(displayed), 4))
+    rows = -(-len(displayed) // columns)
     with new_figure(1.9 * columns, 0.8 + 2.4 * rows) as figure:
         figure.suptitle(
             f"{clip.subject}: {len(reasons)} of {len(timesteps)} timesteps left out (red), threshold "
             f"{decided.threshold:g} mm2 of lip and chin covered\n"
-            f"The {len(shown)} highest scores, outlined what looks covered; "
+            f"The {len(displayed)} highest scores, outlined what looks covered; "
             "an orange bar marks scores near the threshold."
         )
         grid = figure.subplots(rows, columns, squeeze=False).ravel()
-        for axes in grid[len(shown) :]:
+        for axes in grid[len(displayed) :]:
             axes.axis("off")
         for timestep, vertices in posed_meshes(clip, sorted(place)):
-            axes, row = grid[place[timestep]], shown[place[timestep]]
+            axes, row = grid[place[timestep]], displayed[place[timestep]]
             name = next(name for name in decided.cameras if name in frames[timestep])
             image, camera = clip.image(frames[timestep][name]), clip.cameras[name]
             show(axes, mouth_picture(image, camera, atlas, vertices, evidence.patches[row]), frame=True)

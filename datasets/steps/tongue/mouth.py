@@ -155,10 +155,10 @@ def _lip_line(lips: np.ndarray, lower: np.ndarray, camera: Camera) -> FloatArray
         bottom = rows[lips[:, column] & lower[:, column]]
         if len(top) and len(bottom):
             line[column] = 0.5 * (top.max() + bottom.min())
-    known = np.flatnonzero(np.isfinite(line))
-    if not len(known):
+    finite = np.flatnonzero(np.isfinite(line))
+    if not len(finite):
         return np.full(camera.width, camera.K[1, 2])
-    return np.interp(np.arange(camera.width), known, line[known])
+    return np.interp(np.arange(camera.width), finite, line[finite])
 
 
 FACING = np.cos(np.radians(62.0))
@@ -221,10 +221,8 @@ def posed_meshes(clip: Clip, timesteps: Sequence[int]) -> Iterator[tuple[int, Fl
 def sample_clip(
     clip: Clip, atlas: MouthAtlas, cameras: Sequence[str], progress: Progress = no_progress
 ) -> MouthColours:
-    """Sample every timestep of a clip in the given cameras; each image is read once.
-
-    Memory: the result (20 kB per timestep and camera for a map of 50 x 50) and a few images at a time.
-    """
+    """Sample every timestep of a clip in the given cameras; each image is read once. Memory: the result (20 kB per
+    timestep and camera for a map of 50 x 50) and a few images at a time."""
     frames = frames_by_timestep(clip)
     timesteps = [t for t, keys in frames.items() if any(camera in keys for camera in cameras)]
     height, width = atlas.inside.shape
@@ -241,9 +239,9 @@ def sample_clip(
     subject = PosedSubject.of(clip, torch.float32)
     with ThreadPoolExecutor(min(processor_count(), 8)) as pool:
         for start in range(0, len(timesteps), _MESHES):  # a pool would take all jobs and their meshes at once
-            part = timesteps[start : start + _MESHES]
-            meshes = subject.meshes([clip.poses[t] for t in part]).astype(np.float64)
-            rows = range(start, start + len(part))
+            block = timesteps[start : start + _MESHES]
+            meshes = subject.meshes([clip.poses[t] for t in block]).astype(np.float64)
+            rows = range(start, start + len(block))
             for row, _ in zip(rows, pool.map(sample, rows, meshes)):
                 progress(row + 1, len(timesteps), "mouths")
     return MouthColours(timesteps, list(cameras), colours, seen)
@@ -252,11 +250,8 @@ def sample_clip(
 def sample_image(
     image: ByteArray, camera: Camera, atlas: MouthAtlas, vertices: FloatArray
 ) -> tuple[ByteArray, np.ndarray]:
-    """Colours (H, W, 3) of the map's points in one image, and where (H, W) they are seen.
-
-    A point is seen where it faces the camera within 62 degrees, lies in the picture and no triangle of the
-    tracked mesh is in front of it.
-    """
+    """Colours (H, W, 3) of the map's points in one image, and where (H, W) they are seen. A point is seen where it
+    faces the camera within 62 degrees, lies in the picture and no triangle of the tracked mesh is in front of it."""
     colours = np.zeros((*atlas.inside.shape, 3), np.uint8)
     seen = np.zeros(atlas.inside.shape, bool)
     points = atlas.points(vertices)
@@ -286,10 +281,8 @@ def sample_image(
 
 
 def _crop(image: ByteArray, camera: Camera, pixels: FloatArray, depth: float) -> tuple[ByteArray, Camera]:
-    """The image around points (N, 2), reduced by area to about the map's pitch, and the camera that took it.
-
-    Finer images are reduced to avoid sampling noise and pores.
-    """
+    """The image around points (N, 2), reduced by area to about the map's pitch, and the camera that took it. Finer
+    images are reduced to avoid sampling noise and pores."""
     factor = max(1, round(float(PITCH * camera.K[0, 0] / depth)))
     size = np.array([camera.width, camera.height])
     low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - _MARGIN * factor, 0, size)

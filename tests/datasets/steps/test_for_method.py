@@ -7,14 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from headbench.bench.contracts import no_progress
+from headbench.bench.contracts import Camera, no_progress
 from headbench.bench.engine.adaptation import MethodNeeds, plan
 from headbench.bench.errors import InputError
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.refit.refit import BlockFitter
 from headbench.datasets.steps import for_method
-from headbench.datasets.steps.for_method import clip_for_method
+from headbench.datasets.steps.for_method import Alignment, PixelBox, align_clip, clip_for_method, take_box
 
 from ..head.toy import toy_head
 
@@ -114,3 +114,134 @@ def test_what_cannot_be_done_is_said_before_any_work(clip, heads, tmp_path):
     ):
         with pytest.raises(InputError, match=said):
             clip_for_method(clip, MethodNeeds(**needs), at_hand)
+
+
+WHITE = (1.0, 1.0, 1.0)
+RULES = {
+    "reduced": ResolutionRule(divide=4),
+    "enlarged": ResolutionRule(multiply=3),
+    "native input of 2K": ResolutionRule(divide=4, multiply=4),
+    "square": ResolutionRule(square="pad", size=(512, 512)),
+    "cropped": ResolutionRule(square="crop", size=(300, 300)),
+    "uneven": ResolutionRule(size=(123, 287)),
+    "remainder": ResolutionRule(divide=3),
+}
+
+
+def view(width=240, height=344):
+    K = np.array([[700.0, 0, 117.3], [0, 705.0, 180.9], [0, 0, 1]])
+    return Camera("c", width, height, K, np.eye(4))
+
+
+def project(camera, point):
+    x, y, z = camera.K @ np.asarray(point)
+    return np.array([x / z, y / z])
+
+
+def disc(camera, point, radius):
+    """A dark disc at a point's projection on white, its rim a pixel soft: coverage by 8x8 samples per pixel."""
+    centre = project(camera, point)
+    samples = (np.arange(8) + 0.5) / 8
+    y = (np.arange(camera.height)[:, None] + samples).ravel()
+    x = (np.arange(camera.width)[:, None] + samples).ravel()
+    inside = (x[None] - centre[0]) ** 2 + (y[:, None] - centre[1]) ** 2 < radius**2
+    coverage = inside.reshape(camera.height, 8, camera.width, 8).mean((1, 3))
+    return np.repeat((1 - 0.8 * coverage)[..., None], 3, axis=2).astype(np.float32)
+
+
+def centroid(image):
+    darkness = (1 - image.astype(float)).mean(axis=2)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    return np.array([(darkness * x).sum(), (darkness * y).sum()]) / darkness.sum()
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_disc_lands_where_the_aligned_camera_projects_it(name):
+    point = (0.0137, -0.0211, 1.0)
+    camera = view()
+    image = disc(camera, point, 21.3)
+    assert np.abs(centroid(image) - project(camera, point)).max() < 0.01
+    plan = Alignment.of((camera.width, camera.height), RULES[name])
+    aligned = plan.camera(camera)
+    moved = plan.image(image, WHITE)
+    assert moved.shape == (aligned.height, aligned.width, 3)
+    assert (aligned.width, aligned.height) == plan.aligned_size
+    assert np.abs(centroid(moved) - project(aligned, point)).max() < 0.01
+    assert np.abs(centroid(plan.restore(moved, WHITE)) - project(camera, point)).max() < 0.01
+
+
+def test_padding_to_a_square_is_undone_to_the_bit():
+    image = np.random.default_rng(0).random((40, 27, 3)).astype(np.float32)
+    plan = Alignment.of((27, 40), ResolutionRule(square="pad"))
+    padded = plan.image(image, (0.2, 0.4, 0.6))
+    assert padded.shape == (40, 40, 3)
+    assert padded[0, 0] == pytest.approx([0.2, 0.4, 0.6])
+    assert np.array_equal(plan.restore(padded, WHITE), image)
+
+
+def test_a_crop_gives_back_background_where_it_cut():
+    image = np.zeros((10, 6, 3), np.float32)
+    plan = Alignment.of((6, 10), ResolutionRule(square="crop"))
+    restored = plan.restore(plan.image(image, WHITE), WHITE)
+    assert restored[:, 0, 0].tolist() == [1, 1, 0, 0, 0, 0, 0, 0, 1, 1]
+
+
+def test_enlarging_is_undone_by_block_means():
+    """What a method renders four times as large is scored by the mean of each block."""
+    plan = Alignment.of((30, 20), ResolutionRule(multiply=4))
+    render = np.random.default_rng(1).random((80, 120, 3)).astype(np.float32)
+    expected = render.reshape(20, 4, 30, 4, 3).mean((1, 3))
+    assert np.abs(plan.restore(render, WHITE) - expected).max() < 1e-6
+
+
+def test_a_rule_that_changes_nothing_moves_nothing(clip):
+    assert Alignment.of((64, 64), ResolutionRule(square="pad", size=(64, 64))).moves == ()
+    for rule in (ResolutionRule(), ResolutionRule(size=(48, 64), speed_size=(9, 9))):
+        assert align_clip(clip, rule) is clip
+
+
+def test_a_box_outside_the_image_is_background():
+    box = take_box(np.zeros((3, 3, 1), np.float32), PixelBox(5, 5, 2, 2), (0.5,))
+    assert (box == 0.5).all()
+
+
+def test_wrong_sizes_are_refused():
+    plan = Alignment.of((30, 20), ResolutionRule(multiply=2))
+    with pytest.raises(InputError, match="render, size: expected 60x40, found 30x20"):
+        plan.restore(np.zeros((20, 30, 3), np.float32), WHITE)
+    with pytest.raises(InputError, match="camera c"):
+        plan.camera(view())
+    with pytest.raises(InputError, match="at least 50 pixels"):
+        Alignment.of((30, 60), ResolutionRule(divide=50))
+
+
+# ------------------------------------------------------------------ clips
+
+
+def test_a_clip_is_resized_when_read(clip):
+    aligned = align_clip(clip, ResolutionRule(divide=2))
+    key = clip.splits["train"][3]
+    image, mask = aligned.image(key), aligned.mask(key)
+    truth = clip.image(key).reshape(32, 2, 24, 2, 3).astype(float).mean((1, 3))
+    assert image.dtype == np.uint8
+    assert np.abs(image - truth).max() <= 0.5 + 1e-4
+    assert np.abs(mask - clip.mask(key).reshape(32, 2, 24, 2).astype(float).mean((1, 3))).max() <= 0.5 + 1e-4
+    camera, before = aligned.cameras[key.camera], clip.cameras[key.camera]
+    assert (camera.width, camera.height) == (24, 32)
+    assert camera.K[:2] == pytest.approx(before.K[:2] / 2)
+    assert not image.flags.writeable
+    assert aligned.image(key) is image
+    step = aligned.steps[-1]
+    assert (step.name, step.input_fingerprint) == ("align_resolution", clip.fingerprint)
+    assert (step.parameters["rule"]["divide"], step.parameters["sizes"]) == (2, ["48x64 to 24x32"])
+    third = align_clip(clip, ResolutionRule(divide=3))
+    assert len({clip.fingerprint, aligned.fingerprint, third.fingerprint}) == 3
+
+
+def test_padding_has_no_coverage(clip):
+    aligned = align_clip(clip, ResolutionRule(square="pad"))
+    key = clip.splits["train"][0]
+    assert aligned.mask(key).shape == (64, 64)
+    assert not aligned.mask(key)[:, :8].any()
+    assert (aligned.image(key)[:, :8] == 255).all()
+    assert np.array_equal(aligned.image(key)[:, 8:56], clip.image(key))

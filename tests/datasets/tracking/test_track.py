@@ -1,20 +1,32 @@
 """The tracker on pictures of a known mesh: how near it comes, and what it refuses."""
 
+import json
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from headbench.bench import cli
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.tracking import track as track_module
 from headbench.datasets.tracking.fit import Fitter
 from headbench.datasets.tracking.landmarks import known_rig_landmarks, spread_vertices
-from headbench.datasets.tracking.rig import PoseColumns, outliers
-from headbench.datasets.tracking.track import mesh_errors, track
-from headbench.datasets.tracking.views import FrameStack, Views
+from headbench.datasets.tracking.rig import FrameStack, PoseColumns, Views, outliers
+from headbench.datasets.tracking.track import (
+    FOLDER,
+    error_regions,
+    mesh_errors,
+    track,
+    tracking_errors,
+    with_tracking,
+)
+
+from ..head.toy import toy_head
 
 
 def ramp(width, height, along, across):
@@ -201,3 +213,65 @@ def test_spread_points_are_far_apart():
     gaps = np.linalg.norm(chosen[:, None] - chosen, axis=2) + np.eye(20)
     random = np.linalg.norm(points[:20, None] - points[:20], axis=2) + np.eye(20)
     assert gaps.min() > 2 * random.min()
+
+
+@pytest.mark.commands
+def test_the_clip_has_other_tracking_and_the_same_frames(clip, tmp_path, monkeypatch):
+    config = SimpleNamespace(out=str(tmp_path))
+    one = with_tracking(clip, config, seed=1)
+    monkeypatch.setattr("headbench.datasets.tracking.track.track", None)  # the parameters are kept
+    two = with_tracking(clip, config, seed=1)
+    assert one.splits == clip.splits
+    assert one.fingerprint == two.fingerprint != clip.fingerprint
+    assert len([*(tmp_path / FOLDER).glob("*.npz")]) == 1
+    for timestep, pose in one.poses.items():
+        np.testing.assert_array_equal(pose.expression, two.poses[timestep].expression)
+        gap = np.abs(pose.translation - clip.poses[timestep].translation).max()
+        assert 1e-5 < gap < 0.05
+
+
+@pytest.mark.commands
+def test_the_change_reaches_the_rows(patterned_capture, tmp_path):
+    conditions = json.dumps([{}, {"name": "tracked", "clip": {"name": "tracked", "parameters": {"seed": 2}}}])
+    words = f"run --data {patterned_capture.union} --methods ga --preset smoke --out {tmp_path / 'r'}".split()
+    for setting in ("settings.ga.budget.iterations=2", "metrics=psnr", f"conditions={conditions}"):
+        words += ["--set", setting]
+    assert cli.main(words) == 0
+    rows = pd.read_parquet(tmp_path / "r" / "rows.parquet")
+    means = rows[rows["metric"] == "psnr"].groupby("condition")["value"].mean()
+    assert set(means.index) == {"", "tracked"}
+    assert means["tracked"] != means[""]
+
+
+def test_a_shift_is_absolute_and_a_shift_that_changes_is_motion():
+    wanted = np.random.default_rng(0).standard_normal((4, 20, 3))
+    motions = np.tile(np.eye(3), (4, 1, 1))
+    found = mesh_errors(wanted + [0, 0.003, 0.004], wanted, motions)
+    assert found == pytest.approx((5, 0, 0), abs=1e-9)
+    moved = wanted[:2] + np.array([[[0.001, 0, 0]], [[-0.001, 0, 0]]])
+    assert mesh_errors(moved, wanted[:2], motions[:2]).motion == pytest.approx(1)
+
+
+def test_regions_do_not_overlap():
+    regions = error_regions(toy_head(24))
+    inner = [regions[name] for name in ("face", "lips", "lids", "eyeballs") if name in regions]
+    together = np.concatenate(inner)
+    assert len(together) == len(np.unique(together))
+    assert {"face", "lips", "eyeballs"} <= set(regions)
+
+
+def test_a_translated_clip(pristine_capture):
+    exact = read_capture(pristine_capture.union)
+    poses = {
+        t: replace(p, translation=np.asarray(p.translation) + [0, 0, 0.002]) for t, p in exact.poses.items()
+    }
+    errors = tracking_errors(replace(exact, poses=poses), exact)
+    for error in errors.values():
+        assert error.absolute == pytest.approx(2, abs=1e-3)
+        assert error.affine == pytest.approx(0, abs=1e-3)
+
+
+def test_another_topology_is_refused(pristine_capture):
+    clip = read_capture(pristine_capture.union)
+    with pytest.raises(InputError, match="topology"):
+        tracking_errors(replace(clip, head=toy_head(24)), clip)

@@ -11,11 +11,10 @@ import pytest
 
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
+from headbench.datasets.ga.writer import capture_plan, write_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.refit import refit as block
-from headbench.datasets.head.refit.command import refit_capture, target_head
-from headbench.datasets.head.refit.rewrite import capture_plan, write_capture
-from headbench.datasets.head.refit.settings import RefitCommandSettings
+from headbench.datasets.head.refit.command import RefitCommandSettings, refit_capture, target_head
 
 from ...tiny_capture import edit_json, make_plan, write_tiny_capture
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from headbench.datasets.mesh_pictures import rasterize_mesh
-from headbench.datasets.tracking.views import Occlusion, Views
+from headbench.datasets.tracking.rig import Occlusion, Views
 
 from ..head.toy import toy_head
 from ..tiny_capture import projected, rig
