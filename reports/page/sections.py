@@ -45,15 +45,7 @@ class Conclusions:
 def verdict(
     runs: RunSet, metrics: Sequence[MetricSpec], comparisons: Sequence[Mapping[str, Any]]
 ) -> Conclusions:
-    """Describe the results of the ranked methods.
-
-    Parameters
-    ----------
-    metrics : Sequence[MetricSpec]
-        Metrics of frames; sentences are on the first.
-    comparisons : Sequence[Mapping[str, Any]]
-        Those of `compare_methods`.
-    """
+    """Describe the results of the ranked methods by the first of the ``metrics`` of frames and `compare_methods`."""
     found = Conclusions(_title(runs), facts=_facts(runs))
     methods = runs.ranked
     tasks = runs.by_camera.tasks
@@ -183,22 +175,19 @@ class PictureFile:
     count: int
 
 
-def split(images: Sequence[str]) -> list[PictureFile]:
+def picture_files(images: Sequence[str]) -> list[PictureFile]:
     """Distribute base64 images over files of at most `FILE_BYTES`, or with a single image."""
     groups: list[list[str]] = []
-    used = 0
     for image in images:
-        if not groups or used + len(image) > FILE_BYTES:
+        if not groups or sum(map(len, groups[-1])) + len(image) > FILE_BYTES:
             groups.append([])
-            used = 0
         groups[-1].append(image)
-        used += len(image)
-    return [_file(index, group) for index, group in enumerate(groups)]
-
-
-def _file(index: int, images: list[str]) -> PictureFile:
-    text = f"addPictures({index}, {json.dumps(images, separators=(',', ':'))});\n"
-    return PictureFile(f"{FOLDER}/{hashlib.sha256(text.encode()).hexdigest()[:20]}.js", text, len(images))
+    files = []
+    for index, group in enumerate(groups):
+        text = f"addPictures({index}, {json.dumps(group, separators=(',', ':'))});\n"
+        name = f"{FOLDER}/{hashlib.sha256(text.encode()).hexdigest()[:20]}.js"
+        files.append(PictureFile(name, text, len(group)))
+    return files
 
 
 def check_folder(folder: Path) -> None:
@@ -227,10 +216,6 @@ def remove_others(folder: Path, files: Sequence[PictureFile]) -> None:
             path.unlink()
 
 
-def name_of(run: RunData) -> str:
-    return run.folder.root.resolve().name
-
-
 def record_of(run: RunData) -> dict[str, Any]:
     """Provenance of a run's results, as text; without local paths."""
     manifest = run.manifest
@@ -239,7 +224,7 @@ def record_of(run: RunData) -> dict[str, Any]:
     }
     machine = manifest.machine
     return {
-        "name": name_of(run),
+        "name": run.folder.root.resolve().name,
         "done": manifest.status == "done",
         "facts": [
             ("Machine", run.machine),
@@ -282,13 +267,13 @@ def _without_folders(value: Any) -> Any:
 
 def failed_cells(runs: RunSet) -> list[tuple[str, str, str, str]]:
     """Method, seed, subject and error of each avatar that failed."""
-    found: dict[tuple[str, str, str, str], None] = {}
+    cells = []
     for label in runs.rows.failed:
-        own = runs.rows.select(method=label, metric=ALL, task=ALL, region=ALL, seeds=ALL)
-        own = own[own["status"] == "failed"].drop_duplicates(["seed", "subject", "reason"])
-        for seed, subject, reason in own[["seed", "subject", "reason"]].itertuples(index=False, name=None):
-            found[label, str(seed), str(subject), str(reason)] = None
-    return [*found]
+        rows = runs.rows.select(method=label, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+        errors = rows[rows["status"] == "failed"][["seed", "subject", "reason"]].drop_duplicates()
+        for seed, subject, reason in errors.itertuples(index=False, name=None):
+            cells.append((label, str(seed), str(subject), str(reason)))
+    return cells
 
 
 Curve = list[tuple[int, float]]

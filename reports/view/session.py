@@ -190,10 +190,7 @@ p.mantine-Text-root:has(> label) { font-size: 1em !important; letter-spacing: 0 
 class ControlPanel:
     """Controls in the browser of ``client``; ``changed`` is called after each change, ``jumped`` with a camera's name.
 
-    Attributes
-    ----------
-    screenshot, turntable, sequence : button
-        Buttons, whose actions the caller sets.
+    The caller sets the actions of the buttons ``screenshot``, ``turntable`` and ``sequence``.
     """
 
     def __init__(
@@ -211,13 +208,9 @@ class ControlPanel:
         gui.set_panel_label("headbench")
         gui.add_html(LABELS)
         self._legend = gui.add_markdown("")
-        self._mode = self._add(
-            gui.add_dropdown(
-                *("Drawn as", (IMAGES, SPLATS)),
-                initial_value=IMAGES,
-                hint="Images are exact and drawn by the server; splats are drawn by the browser, about 40 dB near.",
-            )
-        )
+        hint = "Images are exact and drawn by the server; splats are drawn by the browser, about 40 dB near."
+        mode = gui.add_dropdown("Drawn as", (IMAGES, SPLATS), initial_value=IMAGES, hint=hint)
+        self._mode = self._add(mode)
         self._background = self._add(gui.add_rgb("Background", initial_value=(255, 255, 255)))
         with gui.add_folder("Recording"):
             names = (*([LIVE] if scene.first.live else []), NEUTRAL, *scene.recordings)
@@ -225,12 +218,9 @@ class ControlPanel:
             self._timestep = self._add(gui.add_slider("Frame", min=0, max=1, step=1, initial_value=0))
             self._playing = self._add(gui.add_checkbox("Play", initial_value=False))
             self._fps = gui.add_slider("Frames per second", min=1, max=MOST_FPS, step=1, initial_value=25)
-            cameras = sorted(scene.first.clip.cameras)
-            self._camera = gui.add_dropdown(
-                *("Camera", (FREE, *cameras)),
-                initial_value=FREE,
-                hint="A camera of the capture shows the captured image next to it, if there is one.",
-            )
+            cameras = FREE, *sorted(scene.first.clip.cameras)
+            hint = "A camera of the capture shows the captured image next to it, if there is one."
+            self._camera = gui.add_dropdown("Camera", cameras, initial_value=FREE, hint=hint)
         self._recording.on_update(lambda _: self._recording_chosen())
         self._camera.on_update(lambda _: jumped("" if self._camera.value == FREE else self._camera.value))
         heads = scene.expressions(expressions)
@@ -385,8 +375,6 @@ class Session:
         self._changed.set()
         self._thread.join(timeout=10.0)
 
-    # -------------------------------------------------------------- the loop
-
     def _run(self) -> None:
         last = time.perf_counter()
         while not self._closed:
@@ -461,11 +449,8 @@ class Session:
                 self._offset = right
                 self._step_back()
             centers = SCALE * (splats.centers + ((number - middle) * APART_M) * self._offset)
-            values = (
-                centers.astype(np.float32),
-                SCALE**2 * splats.covariances,
-                *(splats.colors, splats.opacities),
-            )
+            colors = splats.colors, splats.opacities
+            values = (centers.astype(np.float32), SCALE**2 * splats.covariances, *colors)
             if number in self._handles:
                 self._handles[number].visible = True
                 self._handles[number].set_gaussians(*values)
@@ -480,8 +465,6 @@ class Session:
             start = packed
         self._client.flush()
         self._panel.show_times("; ".join(told))
-
-    # -------------------------------------------------------------- the camera
 
     def _size(self) -> tuple[int, int]:
         """Width and height of the browser's canvas, pixels, at most `MOST_WIDTH` by `MOST_HEIGHT`."""
@@ -530,8 +513,6 @@ class Session:
         if name:
             self._place(self._scene.first.clip.cameras[name])
         self._changed.set()
-
-    # -------------------------------------------------------------- saved files
 
     def _do(self, task: Callable[[], None]) -> None:
         if len(self._tasks) < MOST_TASKS:

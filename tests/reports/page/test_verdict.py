@@ -7,7 +7,7 @@ import pytest
 from headbench.bench.rows import ALL, Rows
 from headbench.reports.page.sections import verdict
 from headbench.reports.runs import RunData, RunSet
-from headbench.reports.statistics.command import CompareSettings, compare_methods
+from headbench.reports.statistics.command import compare_methods
 
 
 @pytest.fixture
@@ -25,8 +25,7 @@ def said(write_run):
         Rows.joined(parts).write(run.folder.rows)
         runs = RunSet.read([run.folder.root])
         metrics = [spec for spec in runs.metrics if spec.per_frame]
-        folders = CompareSettings((str(run.folder.root),))
-        comparisons = compare_methods(runs, folders).data["comparisons"] if len(runs.ranked) > 1 else []
+        comparisons = compare_methods(runs).data["comparisons"] if len(runs.ranked) > 1 else []
         found = verdict(runs, metrics, comparisons)
         return found, re.sub(r"<.*?>", "", " ".join(found.sentences)).replace("\u00a0", " ")
 
