@@ -232,9 +232,7 @@ STORAGE, QUALITY = "storage", "psnr"
 TASKS = ("novel_view", "self_reenactment")
 NO_FRAMES = "The run has frames of neither task."
 STORAGE_CODED = MetricSpec(
-    name="storage_coded",
-    label="Coded",
-    unit="MB",
+    *("storage_coded", "Coded", "MB"),
     higher_is_better=False,
     digits=2,
     implementation="headbench.reports.aggregate:with_coded",
@@ -243,9 +241,7 @@ STORAGE_CODED = MetricSpec(
     tables=("comparison", "cost"),
 )
 CODED_CHANGE = MetricSpec(
-    name="coded_change",
-    label="By coding",
-    unit="dB",
+    *("coded_change", "By coding", "dB"),
     higher_is_better=True,
     digits=2,
     implementation="headbench.reports.aggregate:with_coded",

@@ -114,25 +114,17 @@ def column(spec: MetricSpec, task: str) -> str:
     return f"{spec.name}_{HELD_OUT[task]}" if task in HELD_OUT else spec.name
 
 
-def points_text(
-    points: Sequence[CurvePoint],
-    metrics: Sequence[MetricSpec],
-    tasks: Sequence[str],
-    held: Mapping[str, Mapping[str, Any]],
-    missing: Mapping[str, str],
-    failed: Sequence[str],
-) -> str:
+def points_text(curve: CurveData, failed: Sequence[str]) -> str:
     """Means over subjects as a table, with the held-out data and the missing values."""
-    frame = [spec for spec in metrics if spec.per_frame]
-    costs = {name for name, _ in MEASURED.values()}
-    avatar = [spec for spec in metrics if not spec.per_frame and spec.name not in costs]
-    tracked = any(point.tracking_error is not None for point in points)
+    frame, costs = curve.of_frames, {name for name, _ in MEASURED.values()}
+    avatar = [spec for spec in curve.metrics if not spec.per_frame and spec.name not in costs]
+    tracked = any(point.tracking_error is not None for point in curve.means)
     place = ["method", "part", "budget"]
     heads = [*place, "cameras", "timesteps", "pictures", *["tracking"] * tracked, "CPU s", "s"]
     heads += [f"{spec.label} {spec.unit}".rstrip() for spec in avatar]
     trainings: list[list[str]] = []
-    quality: dict[str, list[list[str]]] = {task: [] for task in tasks if frame}
-    for point in points:
+    quality: dict[str, list[list[str]]] = {task: [] for task in curve.tasks if frame}
+    for point in curve.means:
         budget = point.budget
         size = f"{budget.seconds:g} s" if budget.iterations is None else f"{budget.iterations}"
         where = [point.method, str(point.part), size]
@@ -148,11 +140,12 @@ def points_text(
         title = f"Quality, held-out {HELD_OUT[task]}"
         lines += [table([*place, *(spec.label for spec in frame)], rows, names=3, title=title), ""]
     lines.append("Means over subjects. Held out of every training; no test frame was used:")
-    for subject, parameters in held.items():
+    for subject in curve.subjects:
+        parameters = curve.held_out[subject]
         timesteps = parameters["timesteps"]
         steps = ", ".join([*map(str, timesteps[:6]), *(["..."] if len(timesteps) > 6 else [])])
         lines.append(f"  {subject}: camera {parameters['camera'] or 'none'}, timesteps {steps or 'none'}")
-    lines += [f"{label} missing: {reason}" for label, reason in missing.items()]
+    lines += [f"{label} missing: {reason}" for label, reason in curve.missing.items()]
     return "\n".join([*lines, *(f"failed: {name}" for name in failed)])
 
 
@@ -168,10 +161,8 @@ class CurveReportSettings:
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders that `headbench run curve` wrote."""
-
     out: str
     """Folder to write: curve.csv and curve.png."""
-
     over: Over = "budget"
     """What the trainings differ in, as for `headbench run curve`."""
 
@@ -342,10 +333,9 @@ def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult
         "missing": curve.missing,
         "failed": failed,
     }
-    held_out = {subject: curve.held_out[subject] for subject in curve.subjects}
-    text = points_text(curve.means, curve.metrics, curve.tasks, held_out, curve.missing, failed)
     written = f"Written: {out / 'curve.csv'}, {out / 'curve.png'}"
-    return CommandResult(f"{text}\n\n{leaders_text(curve, markdown=False)}\n\n{written}", data, not failed)
+    text = "\n\n".join([points_text(curve, failed), leaders_text(curve, markdown=False), written])
+    return CommandResult(text, data, not failed)
 
 
 @dataclass(frozen=True)
@@ -380,7 +370,7 @@ def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
     """Read the trainings of runs of the same kind of curve, which differ in the quantity ``over``."""
     points = [point for run in runs for point in _points(run, over)]
     _check_together(runs, points)
-    tasks, metrics = runs[0].tasks, runs[0].metrics
+    tasks, metrics = runs[0].tasks, runs[0].manifest.metrics
     names = list(dict.fromkeys(point.method for point in points))
     order = list(dict.fromkeys(point.subject for point in points))
     trained = {(point.method, point.subject) for point in points}
@@ -416,10 +406,7 @@ def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
 def write_curve(path: Path, curve: CurveData) -> None:
     """Draw the means as a PNG: a row of plots for each task, a plot for each frame metric."""
     axis = curve.clock if curve.over in TIMED else curve.over
-    rows = [
-        [_panel(curve.means, spec, task, axis, curve.missing) for spec in curve.of_frames]
-        for task in curve.tasks
-    ]
+    rows = [[_panel(curve, spec, task, axis) for spec in curve.of_frames] for task in curve.tasks]
     left_out = {
         "novel_view": "a training camera",
         "self_reenactment": f"one of {curve.every} consecutive training timesteps",
@@ -536,7 +523,7 @@ def leaders_text(curve: CurveData, *, markdown: bool = True) -> str:
 
 def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipRecord) -> CurvePoint:
     values: dict[str, float | None] = {}
-    for spec in run.metrics:
+    for spec in run.manifest.metrics:
         for task in run.tasks if spec.per_frame else ("",):
             chosen = run.rows.select(
                 method=record.label, metric=spec.name, task=task, region=FULL, seeds=ALL, subject=clip.subject
@@ -575,12 +562,10 @@ def _reason(rows: Rows, spec: MetricSpec) -> str:
     return " ".join(str(reasons.iloc[0]).split()) if len(reasons) else ""
 
 
-def _panel(
-    points: Sequence[CurvePoint], spec: MetricSpec, task: str, axis: str, missing: Mapping[str, str]
-) -> CurvePanel:
+def _panel(curve: CurveData, spec: MetricSpec, task: str, axis: str) -> CurvePanel:
     """Quality over the horizontal axis: a field of `CurvePoint` or a cost."""
     lines: dict[str, list[tuple[float, float, float]]] = {}
-    for point in points:
+    for point in curve.means:
         cost = _cost(point, axis)
         value, half = point.values[column(spec, task)], point.halves[column(spec, task)]
         line = lines.setdefault(point.method, [])
@@ -589,4 +574,4 @@ def _panel(
             line.append((cost, value, half or 0.0))
     unit = f", {spec.unit}" if spec.unit else ""
     title = f"{spec.label}{unit}, held-out {HELD_OUT[task]}"
-    return CurvePanel(title, lines, missing.get(spec.label, ""))
+    return CurvePanel(title, lines, curve.missing.get(spec.label, ""))

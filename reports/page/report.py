@@ -64,16 +64,12 @@ class PageSettings(RunOptions):
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of finished runs on the same frames, as for `headbench table`."""
-
     out: str | None = None
     """File to write, with --split a folder that is new or holds an earlier report. By default report.html or report."""
-
     split: bool = False
     """Write images to separate files, in a folder with the page."""
-
     max_mb: float | None = None
     """Maximum size in megabytes (10^6 bytes). By default 10, with --split 500."""
-
     papers: Annotated[tuple[str, ...], tyro.conf.arg(name="as")] = ()
     """Papers (`headbench list papers`) in whose table layout the runs are also shown, with the rows of the paper."""
 
@@ -186,7 +182,8 @@ def page_text(
     pictures = choose_pictures(runs, worst, int(room * OPENING_SHARE), options or RunOptions(), progress)
     best = [row.method for row in compact(parts[0].table).rows if not row.trivial]
     first = opening(runs, best, metrics, values, pictures)
-    data["opening"] = _opening(runs, first)
+    data["opening"]["frame"] = None if first.frame is None else _frames(runs).index(first.frame)
+    data["opening"]["methods"] = [runs.methods.index(label) for label in first.methods]
     content["ratio"] = _ratio(runs, first)
     images: list[str] = []
     entries = dict(zip(_frames(runs), data["frames"]))
@@ -234,12 +231,6 @@ def _marks(runs: RunSet) -> dict[str, int]:
     """Number of each method's mark: trivial baselines after the others."""
     order = sorted(runs.methods, key=lambda label: label in runs.trivial)
     return {label: index for index, label in enumerate(order)}
-
-
-def _opening(runs: RunSet, first: Opening) -> dict[str, Any]:
-    """The opening for the script, by index."""
-    frame = None if first.frame is None else _frames(runs).index(first.frame)
-    return {"frame": frame, "methods": [runs.methods.index(label) for label in first.methods]}
 
 
 def _ratio(runs: RunSet, first: Opening) -> str:
@@ -384,16 +375,12 @@ def _plots(runs: RunSet, metrics: Sequence[MetricSpec]) -> list[dict[str, Any]]:
             if len(points) < 2:
                 continue
             sign = 1 if metrics[0].higher_is_better else -1
-            plots.append(
-                {
-                    "task": TASK_TITLES.get(task, task),
-                    "title": f"{TASK_TITLES.get(task, task)}: {metrics[0].label} against {words.split(' (')[0].lower()}",
-                    "x": words,
-                    "y": f"{metrics[0].label} ({metrics[0].unit})" if metrics[0].unit else metrics[0].label,
-                    "points": [list(p) for p in points],
-                    "front": pareto_front([p[1] for p in points], [sign * p[2] for p in points]),
-                }
-            )
+            front = pareto_front([x for _, x, _ in points], [sign * quality for _, _, quality in points])
+            title, label = TASK_TITLES.get(task, task), metrics[0].label
+            against = f"{title}: {label} against {words.split(' (')[0].lower()}"
+            y = f"{label} ({metrics[0].unit})" if metrics[0].unit else label
+            plot = {"task": title, "title": against, "x": words, "y": y, "points": points, "front": front}
+            plots.append(plot)
     return plots
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -95,10 +96,7 @@ def _amount(value: float, spec: MetricSpec) -> str:
 
 
 def _sentence(
-    scores: Sequence[tuple[str, float]],
-    spec: MetricSpec,
-    task: str,
-    comparisons: Sequence[Mapping[str, Any]],
+    scores: Sequence[tuple[str, float]], spec: MetricSpec, task: str, comparisons: Sequence[Mapping[str, Any]]
 ) -> Markup:
     """The best method of a task and its lead over the next, with interval and outcome of the test where there is one."""
     leader, best = scores[0]
@@ -228,9 +226,7 @@ def record_of(run: RunData) -> dict[str, Any]:
         "done": manifest.status == "done",
         "facts": [
             ("Machine", run.machine),
-            ("Cores", str(machine.get("cores", ""))),
-            ("System", str(machine.get("system", ""))),
-            ("Python", str(machine.get("python", ""))),
+            *((name.capitalize(), str(machine.get(name, ""))) for name in ("cores", "system", "python")),
             *((str(name), str(version)) for name, version in dict(machine.get("packages") or {}).items()),
             ("Seconds of the last start", "" if manifest.seconds is None else f"{manifest.seconds:.0f}"),
         ],
@@ -250,9 +246,7 @@ def record_of(run: RunData) -> dict[str, Any]:
 
 def _excluded(frames: dict[tuple[Any, ...], None]) -> list[tuple[str, str, str, str, str]]:
     """Subject, sequence, timestep, number of cameras, reason."""
-    moments: dict[tuple[Any, ...], int] = {}
-    for subject, sequence, timestep, _, why in frames:
-        moments[subject, sequence, timestep, why] = moments.get((subject, sequence, timestep, why), 0) + 1
+    moments = Counter((subject, sequence, timestep, why) for subject, sequence, timestep, _, why in frames)
     return [(subject, seq, str(t), str(n), why) for (subject, seq, t, why), n in sorted(moments.items())]
 
 
@@ -276,38 +270,27 @@ def failed_cells(runs: RunSet) -> list[tuple[str, str, str, str]]:
     return cells
 
 
-Curve = list[tuple[int, float]]
-
-
 def loss_curves(runs: RunSet) -> list[dict[str, Any]]:
     """For each method that recorded positive losses: its index among the methods, and iterations with losses.
 
     Losses are divided by the first recorded one, and averaged over the subjects that recorded the same iterations as the
     first; seeds are those of the pictures. Damaged records are ignored.
     """
-    found = []
+    by_method = []
     for index, label in enumerate(runs.methods):
         run, name = runs.pictured[label]
-        curves = []
+        curves: list[dict[int, float]] = []
         for clip in run.manifest.clips:
-            try:
+            losses: list[tuple[int, float]] = []
+            with suppress(InputError, OSError):
                 losses = training_losses(run.folder.cell(clip.subject, name, run.seed).avatar)
-            except (InputError, OSError):
-                losses = []
             if len(losses) > 1 and all(value > 0 for _, value in losses):
-                curves.append([(at, value / losses[0][1]) for at, value in losses])
+                curves.append({at: value / losses[0][1] for at, value in losses})
         if curves:
-            found.append({"method": index, "points": _mean(curves)})
-    return found
-
-
-def _mean(curves: list[Curve]) -> Curve:
-    iterations = [at for at, _ in curves[0]]
-    alike = [curve for curve in curves if [at for at, _ in curve] == iterations]
-    return [
-        (at, float(f"{sum(curve[i][1] for curve in alike) / len(alike):.4g}"))
-        for i, at in enumerate(iterations)
-    ]
+            alike = [curve for curve in curves if [*curve] == [*curves[0]]]
+            means = ((at, sum(curve[at] for curve in alike) / len(alike)) for at in curves[0])
+            by_method.append({"method": index, "points": [(at, float(f"{mean:.4g}")) for at, mean in means]})
+    return by_method
 
 
 def cards_of(runs: RunSet) -> list[dict[str, Any]]:
@@ -322,19 +305,9 @@ def cards_of(runs: RunSet) -> list[dict[str, Any]]:
         with suppress(HeadbenchError):  # no installed method
             spec: MethodSpec = get("methods", record.name)
             known = spec if spec.implementation == record.implementation else None
-        budget = {name: value for name, value in record.budget.items() if value is not None}
-        cards.append(
-            {
-                "anchor": f"method-{index + 1}",
-                "label": label,
-                "name": record.name,
-                "trivial": record.trivial,
-                "summary": known.summary if known else "",
-                "source": known.source if known else "",
-                "bibtex": known.bibtex.strip() if known else "",
-                "version": record.version,
-                "implementation": record.implementation,
-                "budget": "" if record.trivial else ", ".join(f"{n:,} {name}" for name, n in budget.items()),
-            }
-        )
+        budget = ", ".join(f"{n:,} {name}" for name, n in record.budget.items() if n is not None)
+        recorded = {name: getattr(record, name) for name in ("name", "trivial", "version", "implementation")}
+        texts = {name: getattr(known, name, "").strip() for name in ("summary", "source", "bibtex")}
+        card = {"anchor": f"method-{index + 1}", "label": label, **recorded, **texts}
+        cards.append({**card, "budget": "" if record.trivial else budget})
     return sorted(cards, key=lambda card: card["trivial"])

@@ -106,16 +106,16 @@ def read_points(
         data.rows.check()
         if task not in data.tasks:
             raise InputError(folder, "task", ", ".join(data.tasks), task)
-        of_frames = {m.name: m for m in data.metrics if m.per_frame}
+        of_frames = {m.name: m for m in data.manifest.metrics if m.per_frame}
         metric = metric or next(iter(of_frames), "")
         if metric not in of_frames:
             raise InputError(folder, "metric", f"a metric of frames: {', '.join(of_frames)}", metric)
         spec = spec or of_frames[metric]
-        times = [m.name for m in data.metrics if m.unit == "ms"]
+        times = [m.name for m in data.manifest.metrics if m.unit == "ms"]
         if time and time not in times:
             raise InputError(folder, "time", f"a metric in ms: {', '.join(times) or 'none'}", time)
         check_same_protocol(runs[0], data, task)
-        measured = conditions(data.rows, data.metrics, data.methods)
+        measured = conditions(data.rows, data.manifest.metrics, data.methods)
         derived = {c.name for c in data.manifest.configuration.conditions if c.derive}
         for record in data.manifest.methods:
             if record.trivial:
@@ -183,7 +183,7 @@ def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], lis
     different subjects are joined before (`runs.joined_subjects`).
     """
     measured: list[tuple[int, RatePoint]] = []
-    metrics = [m for m in runs[0].metrics if m.name in METRICS and m.per_frame] if runs else []
+    metrics = [m for m in runs[0].manifest.metrics if m.name in METRICS and m.per_frame] if runs else []
     for index, run in enumerate(runs):
         derived = {c.name for c in run.manifest.configuration.conditions if c.derive}
         steps = {name for name in derived if name == CODED or name.startswith(f"{CODED}-x")}
@@ -292,19 +292,14 @@ class ParetoSettings:
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of finished runs: every method in each is a point, such as the settings of a sweep. Runs of different subjects
     with the same methods and settings are joined; several trainings of a subject have a curve of rates each."""
-
     out: str
     """Folder to write: points.csv and pareto.png; with coded avatars also rates.csv and rate_distortion.png."""
-
     task: str = "novel_view"
     """Task whose frames give the quality."""
-
     metric: str = ""
     """Metric of quality; default: the first of frames that the runs have."""
-
     time: str = ""
     """Metric of frame time, in ms: latency_p50 (default, or 1 / frames per second), processor_time, ..."""
-
     reference: str = ""
     """Method that BD-rates compare with, if the runs have coded avatars at several steps; default: the first."""
 
@@ -443,11 +438,10 @@ def write_plot(
         for axes, cost in plots:
             axes.set(xlabel=costs[cost])
             start_axes(axes, quality)
-            ends = [
-                front_of(points, cost, higher_is_better=higher_is_better, series=s) for s in (None, *colours)
-            ]
-            fronts[cost] = ends
-            _draw(axes, points, cost, dict(zip(colours, ends[1:])), ends[0], colours)
+            how = {"higher_is_better": higher_is_better}
+            best, *others = (front_of(points, cost, series=s, **how) for s in (None, *colours))
+            fronts[cost] = best, *others
+            _draw(axes, points, cost, dict(zip(colours, others)), best, colours)
         figure.draw_without_rendering()  # compute the layout before placing labels
         for axes, cost in plots:
             label_points(axes, points, cost, list(itertools.chain(*fronts[cost])))

@@ -35,29 +35,21 @@ class CompareSettings(BaselineOptions):
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of finished runs on the same frames. Seeds of a method are combined; other settings count as another method."""
-
     against: Annotated[str | None, tyro.conf.arg(metavar="METHOD")] = None
     """Compare every method with this one only, instead of all pairs: with fewer comparisons, fewer subjects are needed."""
-
     metrics: tuple[str, ...] = ()
     """Metrics to compare; default: those of the comparison table."""
-
     trivial: bool = False
     """Also compare the trivial baselines (mean image, nearest camera)."""
-
     region: str = "full"
     """Region of the frames to compare on, such as face."""
-
     sequences: tuple[str, ...] = ()
     """Only frames of these sequences; default: all."""
-
     level: float = 0.05
     """Level of the tests; intervals have a confidence of one minus it."""
-
     equivalence: tuple[str, ...] = ()
     """Also test whether methods are equivalent: METRIC=MARGIN in the metric's unit, such as `psnr=0.3`, for each metric to
     test."""
-
     format: Literal["text", "csv"] = "text"
     """Format of the output; csv adds uncorrected p-values and subjects won, --json also the difference of each subject."""
 

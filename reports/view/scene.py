@@ -38,35 +38,25 @@ class ViewSettings(RunOptions):
 
     avatars: tyro.conf.Positional[tuple[str, ...]]
     """Folders of runs, or of avatars as `headbench render` takes them; an imported avatar needs --data, its capture."""
-
     methods: tuple[str, ...] = ()
     """Only these methods of runs; by default all but the trivial baselines."""
-
     subjects: tuple[str, ...] = ()
     """Only these subjects of runs; by default the first."""
-
     source: str | None = None
     """Capture of another subject, with the same head model, whose sequences drive the avatars too."""
-
     live: str = ""
     """Live signal that drives all avatars: lines of JSON, each a frame as `headbench drive` reads them, on standard input (-) or on
     a port of this machine (a number), at which only programs of this machine can connect."""
-
     signal_head: str = ""
     """With --live: head model of the signal, as of `headbench drive`."""
-
     expressions: int = 10
     """Number of sliders for expressions of each head model: the named ones, else the single coefficients, that move it farthest."""
-
     method: str = ""
     """Method of an avatar outside of runs as package.module:SPEC, where it is not registered."""
-
     device: str = ""
     """Rendering device; by default that of the training."""
-
     port: int = 8080
     """Port of this machine to listen at; 0 takes a free one. Only browsers of this machine can connect."""
-
     seconds: float | None = None
     """Stop after this time; by default when interrupted."""
 
@@ -318,10 +308,7 @@ def _run_of(path: Path) -> tuple[Path | None, tuple[str, str, int] | None]:
 
 
 def _chosen(
-    run: Path,
-    methods: Sequence[ResolvedMethod],
-    settings: ViewSettings,
-    cell: tuple[str, str, int] | None,
+    run: Path, methods: Sequence[ResolvedMethod], settings: ViewSettings, cell: tuple[str, str, int] | None
 ) -> list[ResolvedMethod]:
     names = [method.spec.name for method in methods]
     asked = (cell[1],) if cell else settings.methods
