@@ -201,7 +201,7 @@ def write_contact_sheet(run: Path | FinishedRun, frames_per_task: int = FRAMES_P
         data.folder.contact_sheet,
         title=f"headbench: {', '.join(subjects)}",
         subtitle=f"Frames evenly spaced over each task. Protocol {protocols}. Seed {data.seed}.",
-        scaled_by=[method for method in data.methods if method not in data.trivial],
+        scaled_by=[method.label for method in data.manifest.methods if not method.trivial],
     )
     return [data.folder.contact_sheet]
 

@@ -336,7 +336,10 @@ def citations() -> list[dict[str, Any]]:
         figures = printed_figures(spec)
         code = "headbench, written from the paper" if spec.native else "the authors, in a checkout of yours"
         lines = [spec.summary, f"Source: {spec.source}", f"Code: of {code}"]
-        lines += [f"Printed: {figure_text(figure)}" for figure in figures]
+        for printed in figures:
+            by = f"{'claimed' if printed.own else 'run by others'}: {printed.paper}, {printed.table}"
+            text = f"{_psnr_and_speed(printed.values)} ({by}, {printed.data}, grade {printed.grade})"
+            lines.append(f"Printed: {text}")
         measured = measured_figures(name)
         lines += [f"Measured: {measured_text(measured)}"] if measured else []
         lines += [spec.bibtex.strip()] if spec.bibtex else []
@@ -350,12 +353,6 @@ def citations() -> list[dict[str, Any]]:
 
 SHOWN = {"novel_view/psnr": "novel view", "self_reenactment/psnr": "self-reenactment", "fps": "speed"}
 UNITS = {"fps": "FPS"}
-
-
-def figure_text(figures: PrintedFigures) -> str:
-    """PSNR and speed of a published row as text, with the source."""
-    by = "claimed" if figures.own else "run by others"
-    return f"{_psnr_and_speed(figures.values)} ({by}: {figures.paper}, {figures.table}, {figures.data}, grade {figures.grade})"
 
 
 def measured_text(figures: MeasuredFigures) -> str:

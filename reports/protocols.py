@@ -222,14 +222,8 @@ def _text(
             cells = []
             for method, metric in columns:
                 key, digits = f"{method} {task} {metric}", QUALITY[metric]
-                if key not in means:
-                    cells.append("–")
-                else:
-                    cells.append(
-                        f"{means[key]:.{digits}f}"
-                        if label == USUAL
-                        else f"{means[key] - base[key]:+.{digits}f}"
-                    )
+                subtracted, sign = (0.0, "") if label == USUAL else (base[key], "+")
+                cells.append(f"{means[key] - subtracted:{sign}.{digits}f}" if key in means else "–")
             if set(cells) != {"–"}:
                 lines.append([label, *cells])
         if markdown:

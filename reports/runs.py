@@ -57,11 +57,6 @@ class RunData:
         return tuple(method.label for method in self.manifest.methods)
 
     @property
-    def trivial(self) -> tuple[str, ...]:
-        """Names of the methods that are trivial baselines."""
-        return tuple(method.label for method in self.manifest.methods if method.trivial)
-
-    @property
     def tasks(self) -> tuple[str, ...]:
         """Names of the tasks."""
         return tuple(self.manifest.protocols)

@@ -309,8 +309,8 @@ def curve_report(out: Path, over: str) -> CommandResult:
 def curve_runs(settings: CurveReportSettings, progress: Progress = no_progress) -> CommandResult:
     """Join runs of `headbench run curve`: means over subjects, and the best method for each cost of a
     training."""
-    runs, out = [RunData.read(Path(run)) for run in settings.runs], Path(settings.out)
-    return joined_curve(runs, settings.over, out)
+    runs = [RunData.read(Path(run)) for run in settings.runs]
+    return joined_curve(runs, settings.over, Path(settings.out))
 
 
 def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult:

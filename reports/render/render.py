@@ -180,12 +180,8 @@ def _videos(shots: Sequence[Shot], settings: RenderSettings) -> list[Path]:
     for shot in shots:
         parts.setdefault(shot.video, []).append(shot)
     for video, members in parts.items():
-        kind = COMPOSITE if settings.beside else RENDER
-        write_browser_video(video, (_pictured(shot, settings.beside) for shot in members), settings.fps, kind)
+        images = (read_png(shot.path) for shot in members)
+        if settings.beside:  # the captured image on the left
+            images = (np.hstack([s.captured(), i]) if s.captured else i for s, i in zip(members, images))
+        write_browser_video(video, images, settings.fps, COMPOSITE if settings.beside else RENDER)
     return list(parts)
-
-
-def _pictured(shot: Shot, beside: bool) -> ByteArray:
-    """A frame of a video: the render, with the captured image on its left if requested."""
-    image = read_png(shot.path)
-    return np.hstack([shot.captured(), image]) if beside and shot.captured else image
