@@ -28,7 +28,7 @@ from headbench.reports.papers import (
 from headbench.reports.runs import RunSet
 from headbench.reports.table_report import table_text
 
-from .test_layouts import GEOMETRY, OPACITY
+from .test_table_report import GEOMETRY, OPACITY
 
 
 def figures(name):
