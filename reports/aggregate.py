@@ -113,8 +113,7 @@ OTHERS_LIMIT = 0.1
 """Times are marked if other processes used more than this number of cores in total.
 
 If one core is busy with other processes for a tenth of the time, a frame with synchronised threads takes at most a tenth
-longer.
-Consecutive measurements on an idle machine differ by as much.
+longer. Consecutive measurements on an idle machine differ by as much.
 """
 
 

@@ -225,13 +225,13 @@ def _measured(runs: RunSet, printed: PrintedTable) -> list[str]:
 
 def _printed_metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
     """The metrics of a published table with its decimals, even if the runs lack them."""
-    known = {spec.name: spec for spec in runs.metrics}
+    measured = {spec.name: spec for spec in runs.metrics}
     used = {key.rpartition("/")[2]: bool(key.rpartition("/")[0]) for key in printed.keys}
     metrics = []
     for metric, of_frames in used.items():
         label, unit, higher = (OF_FRAMES if of_frames else OF_AVATARS)[metric]
         kind: MetricKind = "frame" if of_frames else "avatar"
-        spec = known.get(metric, MetricSpec(metric, label, unit, higher, 0, "", kind=kind))
+        spec = measured.get(metric, MetricSpec(metric, label, unit, higher, 0, "", kind=kind))
         # Printed training times are stored in seconds.
         digits = 1 if metric == "training_time" else printed.decimals(metric)
         metrics.append(replace(spec, digits=digits))

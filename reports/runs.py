@@ -369,8 +369,7 @@ def unseen_cameras(
     manifests: Sequence[Manifest], keys: Collection[FrameKey]
 ) -> tuple[frozenset[tuple[str, str]], str]:
     """The (subject, camera) pairs of self-reenactment without training frames; none and a reason, one sentence, if
-    they are all, none, or not the same in all runs.
-    """
+    they are all, none, or not the same in all runs."""
     unseen, why = set(), ""
     cameras = {(key.subject, key.camera) for key in keys}
     for subject in {key.subject for key in keys}:

@@ -186,11 +186,13 @@ def escape_latex(text: str) -> str:
     """Escape text for LaTeX, on one line; characters that pdfLaTeX's fonts lack become code points."""
 
     def escaped(match: re.Match[str]) -> str:
-        found = match[0]
-        if len(found) > 1:  # hyphens, which would become a dash
-            return "{}".join(found)
-        known = " " <= found <= "~" or ("À" <= found <= "ÿ" and found.isalpha() and found not in "ÐÞðþ")
-        return LATEX_ESCAPES.get(found, found if known else rf"\texttt{{U+{ord(found):04X}}}")
+        matched = match[0]
+        if len(matched) > 1:  # hyphens, which would become a dash
+            return "{}".join(matched)
+        printable = " " <= matched <= "~" or (
+            "À" <= matched <= "ÿ" and matched.isalpha() and matched not in "ÐÞðþ"
+        )
+        return LATEX_ESCAPES.get(matched, matched if printable else rf"\texttt{{U+{ord(matched):04X}}}")
 
     return re.sub("--+|.", escaped, unicodedata.normalize("NFC", " ".join(text.split())))
 

@@ -83,14 +83,14 @@ class CurvePoint:
 
 def mean(values: Sequence[float | None]) -> float | None:
     """Mean of numbers; None if any is missing or there are none."""
-    known = [value for value in values if value is not None]
-    return fmean(known) if known and len(known) == len(values) else None
+    present = [value for value in values if value is not None]
+    return fmean(present) if present and len(present) == len(values) else None
 
 
 def _half_width(values: Sequence[float | None]) -> float | None:
     """Half the width of the interval of a mean; None for fewer than `LEAST_SUBJECTS` numbers or a missing one."""
-    known = [value for value in values if value is not None]
-    return half_width(known) if LEAST_SUBJECTS <= len(known) == len(values) else None
+    present = [value for value in values if value is not None]
+    return half_width(present) if LEAST_SUBJECTS <= len(present) == len(values) else None
 
 
 def mean_point(points: Sequence[CurvePoint]) -> CurvePoint:
@@ -223,11 +223,11 @@ def leaders(lines: Lines, *, higher_is_better: bool) -> list[Leader]:
     means = np.stack([curves.mean(0) for curves in values.values()])
     names = list(values)
     best = np.where(np.isnan(means), -np.inf, means).argmax(0)
-    known = np.isfinite(means).any(0)
+    measured = np.isfinite(means).any(0)
     leading: list[Leader] = []
     for place in range(GRID):
         name = names[best[place]]
-        if not known[place] or (leading and leading[-1].method == name):
+        if not measured[place] or (leading and leading[-1].method == name):
             continue
         compared = [lines[name], *(lines[leader.method] for leader in leading[-1:])]
         lowest = max(min(line[subject])[0] for line in compared for subject in subjects)
@@ -489,7 +489,7 @@ def _leaders(
     points: Sequence[CurvePoint], metrics: Sequence[MetricSpec], tasks: Sequence[str], axis: str
 ) -> dict[tuple[str, str], list[Leader]]:
     """`leaders` by name of a frame metric and task; methods with a failed training are excluded."""
-    found = {}
+    by_column = {}
     for spec, task in product((spec for spec in metrics if spec.per_frame), tasks):
         lines: dict[str, dict[str, list[tuple[float, float]]]] = {}
         # A line must not skip a failed training.
@@ -498,8 +498,8 @@ def _leaders(
             cost, value = _cost(point, axis), point.values[column(spec, task)]
             if cost is not None and value is not None:
                 lines.setdefault(point.method, {}).setdefault(point.subject, []).append((cost, value))
-        found[spec.name, task] = leaders(lines, higher_is_better=spec.higher_is_better)
-    return found
+        by_column[spec.name, task] = leaders(lines, higher_is_better=spec.higher_is_better)
+    return by_column
 
 
 def leaders_text(curve: CurveData, *, markdown: bool = True) -> str:
@@ -557,8 +557,8 @@ def _step(steps: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:
 
 def _reason(rows: Rows, spec: MetricSpec) -> str:
     """Reason why a metric was not measured; "" if it was, or if trainings failed."""
-    own = rows.select(method=ALL, metric=spec.name, task=ALL, region=FULL, seeds=ALL)
-    reasons = own.loc[own["status"] == "missing", "reason"]
+    values = rows.select(method=ALL, metric=spec.name, task=ALL, region=FULL, seeds=ALL)
+    reasons = values.loc[values["status"] == "missing", "reason"]
     return " ".join(str(reasons.iloc[0]).split()) if len(reasons) else ""
 
 

@@ -253,10 +253,10 @@ def opening(
     spreads: dict[ShownFrame, float] = {}
     for frame, images in sorted(pictures.shown.items()):
         scores = [values.get((metrics[0].name, label, frame)) for label in chosen] if metrics else []
-        known = [value for value in scores if value is not None]
+        present = [value for value in scores if value is not None]
         complete = all(images[index] is not None for index in (0, *(place[label] for label in chosen)))
-        if complete and known and len(known) == len(chosen) and frame.task == runs.tasks[0]:
-            spreads[frame] = max(known) - min(known)
+        if complete and present and len(present) == len(chosen) and frame.task == runs.tasks[0]:
+            spreads[frame] = max(present) - min(present)
     if spreads:
         return Opening(chosen, max(spreads, key=lambda frame: spreads[frame]))
     first = (f for f in sorted(pictures.shown) if any(image is not None for image in pictures.shown[f]))

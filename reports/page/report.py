@@ -76,7 +76,8 @@ class PageSettings(RunOptions):
     def __post_init__(self) -> None:
         if not self.runs:
             raise ValueError("runs: at least one folder")
-        if self.max_mb is not None and not 0.1 <= self.max_mb <= (most := 4000 if self.split else 1000):
+        most = 4000 if self.split else 1000
+        if self.max_mb is not None and not 0.1 <= self.max_mb <= most:
             raise ValueError(f"max-mb is {self.max_mb}; from 0.1 to {most}")
 
 

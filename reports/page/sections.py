@@ -47,27 +47,26 @@ def verdict(
     runs: RunSet, metrics: Sequence[MetricSpec], comparisons: Sequence[Mapping[str, Any]]
 ) -> Conclusions:
     """Describe the results of the ranked methods by the first of the ``metrics`` of frames and `compare_methods`."""
-    found = Conclusions(_title(runs), facts=_facts(runs))
+    head = Conclusions(_title(runs), facts=_facts(runs))
     methods = runs.ranked
-    tasks = runs.by_camera.tasks
-    if below := not_better(runs.by_camera.rows, metrics, methods, runs.trivial, tasks):
-        found.sentences += [Markup("<b>{}</b>").format(" ".join(below.values())), Markup.escape(BELOW_CAUSES)]
-    found.sentences += [Markup("<b>{}</b>").format(text) for text in mechanisms(runs.rows, methods)[1]]
+    if below := not_better(runs.by_camera.rows, metrics, methods, runs.trivial, runs.by_camera.tasks):
+        head.sentences += [Markup("<b>{}</b>").format(" ".join(below.values())), Markup.escape(BELOW_CAUSES)]
+    head.sentences += [Markup("<b>{}</b>").format(text) for text in mechanisms(runs.rows, methods)[1]]
     methods = tuple(name for name in methods if name not in below)
     for task in runs.by_camera.tasks if metrics else ():
         if scores := _scores(runs.by_camera, methods, metrics[0], task):
-            found.sentences.append(_sentence(scores, metrics[0], task, comparisons))
-    found.sentences += _costs(runs, methods)
+            head.sentences.append(_sentence(scores, metrics[0], task, comparisons))
+    head.sentences += _costs(runs, methods)
     if len(methods) > 1:
         pairs, subjects = len(methods) * (len(methods) - 1) // 2, len(runs.rows.subjects)
         needed = subjects_needed(LEVEL, pairs)
-        found.limit = (
+        head.limit = (
             f"{counted(subjects, 'subject')} cannot show which method is better: a test of {counted(pairs, 'pair')} needs {needed}."
             if subjects < needed
             else f"Exact sign-flip test over {subjects} subjects, Holm’s correction, level {LEVEL:.0%}. It applies to subjects of "
             "captures like these, not to other captures, resolutions or training budgets. “Not significant” does not mean equal."
         )
-    return found
+    return head
 
 
 def _title(runs: RunSet) -> str:
@@ -83,8 +82,8 @@ def _title(runs: RunSet) -> str:
 def _scores(runs: RunSet, names: Sequence[str], spec: MetricSpec, task: str) -> list[tuple[str, float]]:
     """Methods with their means, best first."""
     means = [(name, summarise(runs.rows, name, spec.name, task).value) for name in names]
-    known = [(name, value) for name, value in means if value is not None]
-    return sorted(known, key=lambda pair: -pair[1] if spec.higher_is_better else pair[1])
+    measured = [(name, value) for name, value in means if value is not None]
+    return sorted(measured, key=lambda pair: -pair[1] if spec.higher_is_better else pair[1])
 
 
 def _task(task: str) -> str:
@@ -120,14 +119,14 @@ def _sentence(
 
 def _costs(runs: RunSet, names: Sequence[str]) -> list[Markup]:
     """The smallest and the fastest method, each with the next one."""
-    known, found = {spec.name: spec for spec in runs.metrics}, []
+    specs, sentences = {spec.name: spec for spec in runs.metrics}, []
     for metric, what in ((SIZE, "smallest"), (SPEED, "fastest")):
-        scores = _scores(runs, names, known[metric], "") if metric in known else []
+        scores = _scores(runs, names, specs[metric], "") if metric in specs else []
         if len(scores) > 1:
             (first, value), (second, other) = scores[:2]
-            amounts = _amount(value, known[metric]), second, _amount(other, known[metric])
-            found.append(Markup("<b>{}</b> is the {}, {} ({} {}).").format(first, what, *amounts))
-    return found
+            amounts = _amount(value, specs[metric]), second, _amount(other, specs[metric])
+            sentences.append(Markup("<b>{}</b> is the {}, {} ({} {}).").format(first, what, *amounts))
+    return sentences
 
 
 def _facts(runs: RunSet) -> list[tuple[str, str]]:
@@ -301,13 +300,13 @@ def cards_of(runs: RunSet) -> list[dict[str, Any]]:
     """
     cards = []
     for index, (label, record) in enumerate(runs.records.items()):
-        known: MethodSpec | None = None
+        registered: MethodSpec | None = None
         with suppress(HeadbenchError):  # no installed method
             spec: MethodSpec = get("methods", record.name)
-            known = spec if spec.implementation == record.implementation else None
+            registered = spec if spec.implementation == record.implementation else None
         budget = ", ".join(f"{n:,} {name}" for name, n in record.budget.items() if n is not None)
         recorded = {name: getattr(record, name) for name in ("name", "trivial", "version", "implementation")}
-        texts = {name: getattr(known, name, "").strip() for name in ("summary", "source", "bibtex")}
+        texts = {name: getattr(registered, name, "").strip() for name in ("summary", "source", "bibtex")}
         card = {"anchor": f"method-{index + 1}", "label": label, **recorded, **texts}
         cards.append({**card, "budget": "" if record.trivial else budget})
     return sorted(cards, key=lambda card: card["trivial"])

@@ -81,11 +81,11 @@ def front_of(
     points: Sequence[ParetoPoint], cost: str, *, higher_is_better: bool, series: str | None = None
 ) -> list[int]:
     """Indices of the front of all points, or of one series, whose cost (a field of `ParetoPoint`) was measured."""
-    among = [i for i, point in enumerate(points) if series in (None, point.series)]
-    known = [i for i in among if getattr(points[i], cost) is not None]
+    costs = {i: getattr(point, cost) for i, point in enumerate(points) if series in (None, point.series)}
+    measured = [i for i, value in costs.items() if value is not None]
     sign = 1.0 if higher_is_better else -1.0
-    front = pareto_front([getattr(points[i], cost) for i in known], [sign * points[i].quality for i in known])
-    return [known[i] for i in front]
+    front = pareto_front([costs[i] for i in measured], [sign * points[i].quality for i in measured])
+    return [measured[i] for i in front]
 
 
 def read_points(
@@ -269,16 +269,16 @@ def rate_differences(
 
 
 def _difference(method: str, reference: str, metric: str, values: Sequence[float | None]) -> RateDifference:
-    known = [value for value in values if value is not None]
-    if len(known) < len(values) or not values:
+    logarithms = [value for value in values if value is not None]
+    if len(logarithms) < len(values) or not values:
         reason = (
-            f"{len(values) - len(known)} of {len(values)} subjects have fewer than {LEAST_POINTS} steps of increasing quality, or curves "
+            f"{len(values) - len(logarithms)} of {len(values)} subjects have fewer than {LEAST_POINTS} steps of increasing quality, or curves "
             "without a common range of quality"
         )
         return RateDifference(method, reference, metric, None, reason=reason)
-    mean, half = fmean(known), half_width(known) if len(known) >= LEAST_SUBJECTS else None
+    mean, half = fmean(logarithms), half_width(logarithms) if len(logarithms) >= LEAST_SUBJECTS else None
     low, high = (None, None) if half is None else (_percent(mean - half), _percent(mean + half))
-    return RateDifference(method, reference, metric, _percent(mean), low, high, len(known))
+    return RateDifference(method, reference, metric, _percent(mean), low, high, len(logarithms))
 
 
 def _percent(logarithm: float) -> float:
@@ -477,9 +477,9 @@ def _draw_rates(
     axes: Axes, points: Sequence[RatePoint], metric: str, name: str, colour: str, marker: str
 ) -> bool:
     """Draw the curve of one method; return whether there is one."""
-    own = {point.variant: point.mean(metric) for point in points if point.method == name}
-    trained = own.pop("", None)
-    curve = sorted((*value, variant) for variant, value in own.items() if value is not None)
+    means = {point.variant: point.mean(metric) for point in points if point.method == name}
+    trained = means.pop("", None)
+    curve = sorted((*value, variant) for variant, value in means.items() if value is not None)
     if curve:
         axes.plot(*list(zip(*curve))[:2], f"{marker}-", color=colour, markersize=MARKER - 2, linewidth=1)
         for size, value, variant in curve:

@@ -124,8 +124,8 @@ class LivePoses:
             except Exception as error:  # the next line may be a good one
                 if text_of(error) != self._said:  # an invalid signal would repeat the message for each line
                     self._said = text_of(error)
-                    known = isinstance(error, HeadbenchError)
-                    log.warning("%s", error if known else f"live signal: {self._said}", exc_info=not known)
+                    named = isinstance(error, HeadbenchError)
+                    log.warning("%s", error if named else f"live signal: {self._said}", exc_info=not named)
                 continue
             for listener in tuple(self._listeners):
                 listener()

@@ -115,8 +115,8 @@ def moved(scene: Scene, shown: ShownAvatar, camera: Camera, key: FrameKey | None
     """Convert a camera to an avatar's world; for another subject, relative to its head."""
     motion = np.eye(4)
     motion[:3, 3] = scene.first.center - shown.center
-    there = Camera(camera.id, camera.width, camera.height, camera.K, camera.world_to_camera @ motion)
-    return shown.camera(there, key)
+    translated = Camera(camera.id, camera.width, camera.height, camera.K, camera.world_to_camera @ motion)
+    return shown.camera(translated, key)
 
 
 def splats_of(scene: Scene, shown: ShownAvatar, state: State, view: FreeView) -> SplatArrays | None:
@@ -125,17 +125,17 @@ def splats_of(scene: Scene, shown: ShownAvatar, state: State, view: FreeView) ->
         return None
     key = key_of(scene, state)
     camera = moved(scene, shown, view.camera(LEAST_PX, LEAST_PX), key)
-    found = shown.avatar.splats(pose_of(shown, state, key), camera)
-    if found.colors is None:
+    splats = shown.avatar.splats(pose_of(shown, state, key), camera)
+    if splats.colors is None:
         return None
     # From the method's world into that of the first avatar: the same camera in both.
     back = np.linalg.inv(view.world_to_camera) @ camera.world_to_camera
-    axes = (back[:3, :3] @ rotations(found.quats)) * found.scales[:, None, :]
+    axes = (back[:3, :3] @ rotations(splats.quats)) * splats.scales[:, None, :]
     return SplatArrays(
-        (found.means @ back[:3, :3].T + back[:3, 3]).astype(np.float32),
+        (splats.means @ back[:3, :3].T + back[:3, 3]).astype(np.float32),
         np.asarray(axes @ axes.transpose(0, 2, 1), np.float32),
-        np.clip(found.colors, 0.0, 1.0),
-        found.opacities[:, None],
+        np.clip(splats.colors, 0.0, 1.0),
+        splats.opacities[:, None],
     )
 
 

@@ -348,6 +348,7 @@ def test_frames_are_added_evenly_and_from_all_groups():
     ("changes", "message"),
     [
         ({"max_mb": 0.1}, r"--max-mb"),
+        ({"max_mb": 0.01}, r"from 0.1 to 1000"),
         ({"out": "nowhere/page.html"}, r"in an existing folder, found no folder nowhere"),
         ({"runs": ("nothing",)}, r"no run.json"),
     ],
@@ -357,7 +358,7 @@ def test_faulty_input_is_refused_and_leaves_no_file(page, toy_run, tmp_path, mon
     before = sorted(tmp_path.rglob("*"))
     if "max_mb" in changes:
         monkeypatch.setattr(frames, "encode", lambda image, quality: "x" * 10**6)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises((InputError, ValueError), match=message):
         page(**changes)
     assert sorted(tmp_path.rglob("*")) == before
 
