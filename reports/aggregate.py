@@ -113,8 +113,7 @@ OTHERS_LIMIT = 0.1
 """Times are marked if other processes used more than this number of cores in total.
 
 If one core is busy with other processes for a tenth of the time, a frame with synchronised threads takes at most a tenth
-longer.
-Consecutive measurements on an idle machine differ by as much.
+longer. Consecutive measurements on an idle machine differ by as much.
 """
 
 
@@ -232,9 +231,7 @@ STORAGE, QUALITY = "storage", "psnr"
 TASKS = ("novel_view", "self_reenactment")
 NO_FRAMES = "The run has frames of neither task."
 STORAGE_CODED = MetricSpec(
-    name="storage_coded",
-    label="Coded",
-    unit="MB",
+    *("storage_coded", "Coded", "MB"),
     higher_is_better=False,
     digits=2,
     implementation="headbench.reports.aggregate:with_coded",
@@ -243,9 +240,7 @@ STORAGE_CODED = MetricSpec(
     tables=("comparison", "cost"),
 )
 CODED_CHANGE = MetricSpec(
-    name="coded_change",
-    label="By coding",
-    unit="dB",
+    *("coded_change", "By coding", "dB"),
     higher_is_better=True,
     digits=2,
     implementation="headbench.reports.aggregate:with_coded",

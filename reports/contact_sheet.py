@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +36,8 @@ def robustness_report(folder: Path) -> CommandResult:
     avatars, failed = record["avatars"], record.get("failed", [])
     rendered = [avatar for avatar in avatars if "missing" not in avatar]
     text = table(avatars)
-    for each in failed:
-        text += f"\n{each['subject']} {each['method']} seed {each['seed']} failed: {each['reason']}"
+    for avatar in failed:
+        text += f"\n{avatar['subject']} {avatar['method']} seed {avatar['seed']} failed: {avatar['reason']}"
     if rendered:
         write = write_extremes_sheet if "views" in rendered[0] else write_reenact_sheet
         write(folder, rendered)
@@ -117,32 +117,30 @@ def _extremes_sections(folder: Path, avatar: Mapping[str, Any], width: int) -> l
 
     def rows(frames: Sequence[Mapping[str, Any] | None], label: str) -> list[TileRow]:
         """The ground truth of some frames, if available, with their renders below; None leaves a gap."""
-        made = []
-        for name, shown in (("truth", "truth"), ("render", "driven")):
-            if all(frame is None or shown in frame for frame in frames):
-                tiles = [Tile("") if frame is None else tile(frame, shown) for frame in frames]
-                made.append(TileRow([label, name], tiles))
-        return made
+        lines = []
+        for name, picture in (("truth", "truth"), ("render", "driven")):
+            if all(frame is None or picture in frame for frame in frames):
+                tiles = [Tile("") if frame is None else tile(frame, picture) for frame in frames]
+                lines.append(TileRow([label, name], tiles))
+        return lines
 
-    def tile(frame: Mapping[str, Any], shown: str) -> Tile:
+    def tile(frame: Mapping[str, Any], picture: str) -> Tile:
         _, sequence, _, camera = frame["key"].split("/")
-        mark = BROKEN if shown == "driven" and frame["key"] in broken else ""
+        mark = BROKEN if picture == "driven" and frame["key"] in broken else ""
         mark = mark or (EXTRAPOLATED if views[camera]["extrapolated"] else "")
-        return Tile(_picture(folder / frame[shown], width), sequence if shown == "driven" else "", mark)
+        return Tile(_picture(folder / frame[picture], width), sequence if picture == "driven" else "", mark)
 
-    made = []
-    for index in range(max(map(len, columns.values()))):
-        frames = [column[index] if index < len(column) else None for column in columns.values()]
-        made += rows(frames, "samples" if index else "typical")
+    turntable = []
+    for index, frames in enumerate(zip_longest(*columns.values())):
+        turntable += rows(frames, "samples" if index else "typical")
     title = f"{avatar['method']}, subject {avatar['subject']}, seed {avatar['seed']}"
-    found = f"{avatar['frames_broken']} of {avatar['frames']} frames exceed a limit"
-    sections = [
-        SheetSection(f"{title}: {found}", [f"{view['azimuth']:+.0f}°" for view in views.values()], made)
-    ]
-    lines = [path[start : start + len(views)] for start in range(0, len(path), len(views))]
-    if lines:
-        made = [row for line in lines for row in rows(line, "path")]
-        sections.append(SheetSection(f"{title}: path", [""] * len(views), made))
+    limits = f"{avatar['frames_broken']} of {avatar['frames']} frames exceed a limit"
+    heads = [f"{view['azimuth']:+.0f}°" for view in views.values()]
+    sections = [SheetSection(f"{title}: {limits}", heads, turntable)]
+    if path:
+        starts = range(0, len(path), len(views))
+        lines = [row for start in starts for row in rows(path[start : start + len(views)], "path")]
+        sections.append(SheetSection(f"{title}: path", [""] * len(views), lines))
     return sections
 
 
@@ -169,13 +167,13 @@ def table(avatars: Sequence[Mapping[str, Any]]) -> str:
         if "no_truth" in avatar:
             lines.append(f"  not compared with the truth: {avatar['no_truth']}")
         lines.append(form("measure", "mean", "worst", "failed", "frames"))
-        for name, found in avatar["measures"].items():
-            if found["frames"] or found["failed"]:
-                values = ("-" if found[key] is None else f"{found[key]:.3f}" for key in ("mean", "worst"))
-                lines.append(form(name.replace("_", " "), *values, found["failed"], found["frames"]))
+        for name, measure in avatar["measures"].items():
+            if measure["frames"] or measure["failed"]:
+                values = ("-" if measure[k] is None else f"{measure[k]:.3f}" for k in ("mean", "worst"))
+                lines.append(form(name.replace("_", " "), *values, measure["failed"], measure["frames"]))
         if avatar.get("identity") is not None:
-            known = [f"{name} {value:.1f}" for name, value in avatar["identity"].items() if value is not None]
-            lines.append(f"  colour difference from the subject's recordings (CIEDE2000): {', '.join(known)}")
+            parts = [f"{name} {value:.1f}" for name, value in avatar["identity"].items() if value is not None]
+            lines.append(f"  colour difference from the subject's recordings (CIEDE2000): {', '.join(parts)}")
         lines += [f"  {b['key']}: {'; '.join(b['limits'])}" for b in avatar["broken"][:5]]
         if len(avatar["broken"]) > 5:
             lines.append(f"  and {len(avatar['broken']) - 5} more; all are in {RECORD_FILE}")
@@ -203,7 +201,7 @@ def write_contact_sheet(run: Path | FinishedRun, frames_per_task: int = FRAMES_P
         data.folder.contact_sheet,
         title=f"headbench: {', '.join(subjects)}",
         subtitle=f"Frames evenly spaced over each task. Protocol {protocols}. Seed {data.seed}.",
-        scaled_by=[method for method in data.methods if method not in data.trivial],
+        scaled_by=[method.label for method in data.manifest.methods if not method.trivial],
     )
     return [data.folder.contact_sheet]
 
@@ -232,25 +230,24 @@ class ComparedFrame:
         width: int = PANEL_WIDTH,
     ) -> ComparedFrame:
         """Resize images to a width: wider ones are reduced to it (by area), narrower ones enlarged by the largest
-        integer factor that fits (nearest neighbour). Raises `InputError` for a render that differs in size from
-        the ground truth.
+        integer factor that fits (nearest neighbour).
         """
-        height, own = ground_truth.shape[:2]
-        factor = width // own or width / own
-        size = (max(1, round(own * factor)), max(1, round(height * factor)))
-        shown: dict[str, ByteArray | str] = {}
+        height, original = ground_truth.shape[:2]
+        factor = width // original or width / original
+        size = (max(1, round(original * factor)), max(1, round(height * factor)))
+        resized: dict[str, ByteArray | str] = {}
         errors = {}
         for method, image in renders.items():
             if isinstance(image, str):
-                shown[method] = image
+                resized[method] = image
                 continue
             if image.shape != ground_truth.shape:
-                expected, found = (f"shape {one.shape}" for one in (ground_truth, image))
-                raise InputError("contact sheet", f"render of {method}", expected, found)
-            shown[method] = _resized(image, size)
+                shapes = (f"shape {array.shape}" for array in (ground_truth, image))
+                raise InputError("contact sheet", f"render of {method}", *shapes)
+            resized[method] = _resized(image, size)
             # Reduced after the difference, since errors of opposite sign would cancel if reduced before.
             errors[method] = _resized(np.abs(image.astype(np.float32) - ground_truth).mean(axis=2), size)
-        return cls(section, labels, _resized(ground_truth, size), shown, errors, captions)
+        return cls(section, labels, _resized(ground_truth, size), resized, errors, captions)
 
 
 def contact_sheet(
@@ -264,18 +261,9 @@ def contact_sheet(
 ) -> None:
     """Draw the sheet and write it as a PNG, atomically: ground truth, then a render and an error map for each method.
 
-    All error maps of the sheet share a scale: a round number at or above the 99th percentile of the errors.
-    Larger errors are clipped.
-
-    Parameters
-    ----------
-    frames : Sequence[ComparedFrame]
-        Frames, at least one; frames of a section are consecutive.
-    methods : Sequence[str]
-        Columns, in order.
-    scaled_by : Sequence[str]
-        Methods whose errors determine the scale (default: all), so that a trivial baseline does not darken
-        the others.
+    All error maps of the sheet share a scale: a round number at or above the 99th percentile of the errors of the methods
+    ``scaled_by`` (default: all), so that a trivial baseline does not darken the others. Larger errors are clipped. ``frames`` of
+    a section are consecutive, ``methods`` are the columns.
     """
     if not frames:
         raise InputError("contact sheet", "rows", "at least one frame", "none")
@@ -295,17 +283,15 @@ def contact_sheet(
         SheetSection(section, heads, [row(frame) for frame in members])
         for section, members in groupby(frames, key=lambda frame: frame.section)
     ]
-    more = " or more" if scale < NICE_SCALES[-1] else ""
-    write_sheet(
-        out, sections, title=title, subtitle=subtitle, error_scale=(scale, more), pairs=True, label_width=150
-    )
+    bar = scale, " or more" if scale < NICE_SCALES[-1] else ""
+    write_sheet(out, sections, title=title, subtitle=subtitle, error_scale=bar, pairs=True, label_width=150)
 
 
 def compared_frame(
     data: RunData, task: str, key: FrameKey, methods: Sequence[str], width: int = PANEL_WIDTH
 ) -> ComparedFrame:
     """One frame of a run with the renders of some ``methods``, and their values of the run's first frame metric."""
-    metric = next((m for m in data.metrics if m.per_frame), None)
+    metric = next((m for m in data.manifest.metrics if m.per_frame), None)
     renders: dict[str, ByteArray | str] = {}
     captions: dict[str, str] = {}
     for method in methods:

@@ -215,16 +215,9 @@ def write_sheet(
 ) -> None:
     """Draw sections below each other and write a PNG, atomically.
 
-    Parameters
-    ----------
-    marks : Mapping[str, str] | None
-        Legend of the colours around images: meaning by colour.
-    error_scale : tuple[int, str] | None
-        Value of the brightest colour of error maps and the text after it, for a colour bar.
-    pairs : bool
-        Use a smaller gap between columns 1 and 2, 3 and 4, ...
-    label_width : int
-        Width of the row labels on the left, pixels.
+    ``marks`` are the legend of the colours around images (meaning by colour), ``error_scale`` is the value of the brightest colour
+    of error maps and the text after it, for a colour bar. ``pairs``: smaller gaps between columns 1 and 2, 3 and 4, ...;
+    ``label_width``: of the row labels on the left, pixels.
     """
     tiles = [tile for section in sections for row in section.rows for tile in row.tiles]
     width = max((t.picture.shape[1] for t in tiles if not isinstance(t.picture, str)), default=label_width)

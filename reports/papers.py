@@ -54,24 +54,12 @@ COMPARABLE = ("A", "B")
 
 @dataclass(frozen=True)
 class PrintedRow:
-    """A row of a printed table.
+    """A row of a printed table."""
 
-    Attributes
-    ----------
-    name : str
-        As printed.
-    values : dict[str, str]
-        As printed, by ``task/metric``, or ``metric`` for one of the avatar as a whole.
-    method : str
-        Name of the registered method; "" if it is not registered.
-    settings : dict[str, Any]
-        Settings of a measured method that match this row, by dotted name.
-    """
-
-    name: str
-    values: dict[str, str]
-    method: str = ""
-    settings: dict[str, Any] = field(default_factory=dict)
+    name: str  # as printed, like the values
+    values: dict[str, str]  # by ``task/metric``, or ``metric`` for one of the avatar as a whole
+    method: str = ""  # name of the registered method; "" if it is not registered
+    settings: dict[str, Any] = field(default_factory=dict)  # of methods that match this row, by dotted name
 
     def __post_init__(self) -> None:
         """Refuse values that are not numbers as text, and unknown metrics."""
@@ -79,8 +67,7 @@ class PrintedRow:
             raise ValueError("values: at least one; found none")
         for key, value in self.values.items():
             task, _, metric = key.rpartition("/")
-            known = metric in (OF_FRAMES if task else OF_AVATARS) and (not task or task in TASKS)
-            if not known:
+            if metric not in (OF_FRAMES if task else OF_AVATARS) or task not in ("", *TASKS):
                 expected = f"TASK/METRIC of {', '.join(TASKS)} and {', '.join(OF_FRAMES)}; or {', '.join(OF_AVATARS)}"
                 raise ValueError(f"values: {expected}; found {key}")
             if not isinstance(value, str) or not re.fullmatch(r"-?\d*\.?\d+", value):
@@ -102,29 +89,18 @@ class PrintedRow:
 class PrintedTable:
     """A table of a paper.
 
-    Attributes
-    ----------
-    table : str
-        Name in the paper, such as "Table 3" or "Table 3 (left part)", or a description if its number was not read.
-    data : str
-        Subjects or data set.
-    conditions : str
-        Conditions of the values: size, split, mask, definitions of metrics, iterations, hardware.
-    grade : Literal['A', 'B', 'C']
-        How it was read. "A": in the paper's full text or supplement, or in its authors' repository; "B": as the full text of
-        another paper quotes it; "C": in a summary.
-    read : str
-        Where it was read.
-    rows : tuple[PrintedRow, ...]
-        All rows that were read.
+    ``grade`` says how it was read. "A": in the paper's full text or supplement, or in its authors' repository; "B": as the full
+    text of another paper quotes it; "C": in a summary.
     """
 
-    table: str
-    data: str
-    conditions: str
+    table: (
+        str  # name, such as "Table 3" or "Table 3 (left part)", or a description if its number was not read
+    )
+    data: str  # subjects or data set
+    conditions: str  # size, split, mask, definitions of metrics, iterations, hardware
     grade: Literal["A", "B", "C"]
-    read: str
-    rows: tuple[PrintedRow, ...]
+    read: str  # where
+    rows: tuple[PrintedRow, ...]  # all that were read
 
     def __post_init__(self) -> None:
         """Refuse tables without rows or with duplicate names of rows."""
@@ -135,8 +111,8 @@ class PrintedTable:
     @property
     def number(self) -> str:
         """Number in the paper or, if unknown, name of the table."""
-        found = re.match(r"Tables? ([0-9A-Z]+)", self.table)
-        return found[1] if found else self.table
+        match = re.match(r"Tables? ([0-9A-Z]+)", self.table)
+        return match[1] if match else self.table
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -187,12 +163,12 @@ def paper_named(name: str) -> Paper:
 def printed_tables(name: str, number: str | None) -> tuple[PrintedTable, ...]:
     """The tables of a paper that may be shown next to measurements, or one by number. Raises `InputError` if there is none."""
     tables = [table for table in paper_named(name).tables if table.grade in COMPARABLE]
-    found = [table for table in tables if number is None or table.number == number]
-    if not found:
+    requested = tuple(table for table in tables if number is None or table.number == number)
+    if not requested:
         offered = ", ".join(dict.fromkeys(table.table for table in tables)) or "none of them read in full"
-        option, given = ("--as", name) if number is None else ("--table", number)
-        raise InputError("command line", option, f"a table of {name}: {offered}", given)
-    return tuple(found)
+        option, value = ("--as", name) if number is None else ("--table", number)
+        raise InputError("command line", option, f"a table of {name}: {offered}", value)
+    return requested
 
 
 def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
@@ -238,28 +214,28 @@ def as_printed(runs: RunSet, name: str, printed: PrintedTable) -> Table:
 
 def _measured(runs: RunSet, printed: PrintedTable) -> list[str]:
     """Labels of the ranked methods, and of conditions whose changed settings, and nothing else, make them a row of the table."""
-    known = {c.name: c for run in runs.runs for c in run.manifest.configuration.conditions}
-    chosen = {*runs.ranked}
+    conditions = {c.name: c for run in runs.runs for c in run.manifest.configuration.conditions}
+    labels = {*runs.ranked}
     for row in printed.rows:
-        own = {label for label, record in runs.records.items() if row.is_of(record)}
-        if own.isdisjoint(runs.ranked):
-            chosen |= {label for label in own if known[runs.records[label].condition].changes_settings_alone}
-    return [label for label in runs.methods if label in chosen]
+        of_row = {label for label, record in runs.records.items() if row.is_of(record)}
+        if of_row.isdisjoint(runs.ranked):
+            labels |= {n for n in of_row if conditions[runs.records[n].condition].changes_settings_alone}
+    return [label for label in runs.methods if label in labels]
 
 
 def _printed_metrics(runs: RunSet, printed: PrintedTable) -> list[MetricSpec]:
     """The metrics of a published table with its decimals, even if the runs lack them."""
-    known = {spec.name: spec for spec in runs.metrics}
+    measured = {spec.name: spec for spec in runs.metrics}
     used = {key.rpartition("/")[2]: bool(key.rpartition("/")[0]) for key in printed.keys}
-    found = []
+    metrics = []
     for metric, of_frames in used.items():
         label, unit, higher = (OF_FRAMES if of_frames else OF_AVATARS)[metric]
         kind: MetricKind = "frame" if of_frames else "avatar"
-        spec = known.get(metric, MetricSpec(metric, label, unit, higher, 0, "", kind=kind))
+        spec = measured.get(metric, MetricSpec(metric, label, unit, higher, 0, "", kind=kind))
         # Printed training times are stored in seconds.
         digits = 1 if metric == "training_time" else printed.decimals(metric)
-        found.append(replace(spec, digits=digits))
-    return found
+        metrics.append(replace(spec, digits=digits))
+    return metrics
 
 
 def _printed_name(record: MethodRecord, label: str, printed: PrintedTable) -> str:
@@ -294,16 +270,12 @@ def listed() -> list[dict[str, Any]]:
 def counts() -> dict[str, dict[str, int]]:
     """Numbers of tables, rows and values of all papers, by grade."""
     tables = [table for paper in papers().values() for table in paper.tables]
-    found = {}
+    by_grade = {}
     for grade in ("A", "B", "C"):
-        own = [table for table in tables if table.grade == grade]
-        rows = [row for table in own for row in table.rows]
-        found[grade] = {
-            "tables": len(own),
-            "rows": len(rows),
-            "values": sum(len(row.values) for row in rows),
-        }
-    return found
+        of_grade = [table for table in tables if table.grade == grade]
+        values = [len(row.values) for table in of_grade for row in table.rows]
+        by_grade[grade] = {"tables": len(of_grade), "rows": len(values), "values": sum(values)}
+    return by_grade
 
 
 MEASURED = Path(__file__).with_name("measured.json")
@@ -325,16 +297,15 @@ class PrintedFigures:
 def printed_figures(spec: MethodSpec) -> list[PrintedFigures]:
     """Rows of a method in all stored tables of grades A and B, those of its own paper first, without ablations."""
     numbers = {*re.findall(r"\d{4}\.\d{4,5}", spec.source)}
-    found = []
-    for name, paper in papers().items():
-        for table in paper.tables:
-            if table.grade not in COMPARABLE or "ablation" in table.table:
-                continue
-            for row in table.rows:
-                if row.method == spec.name:
-                    own = paper.arxiv in numbers
-                    found.append(PrintedFigures(name, table.table, table.data, table.grade, own, row.values))
-    return sorted(found, key=lambda figures: not figures.own)
+    figures = [
+        PrintedFigures(name, t.table, t.data, t.grade, paper.arxiv in numbers, row.values)
+        for name, paper in papers().items()
+        for t in paper.tables
+        if t.grade in COMPARABLE and "ablation" not in t.table
+        for row in t.rows
+        if row.method == spec.name
+    ]
+    return sorted(figures, key=lambda printed: not printed.own)
 
 
 @dataclass(frozen=True)
@@ -363,41 +334,25 @@ def citations() -> list[dict[str, Any]]:
         if not isinstance(spec, MethodSpec) or not spec.source:
             continue
         figures = printed_figures(spec)
-        lines = [spec.summary, f"Source: {spec.source}"]
-        code = (
-            "of headbench, written from the paper"
-            if spec.native
-            else "of the authors, in a checkout of yours"
-        )
-        lines.append(f"Code: {code}")
-        lines += [f"Printed: {figure_text(figure)}" for figure in figures]
+        code = "headbench, written from the paper" if spec.native else "the authors, in a checkout of yours"
+        lines = [spec.summary, f"Source: {spec.source}", f"Code: of {code}"]
+        for printed in figures:
+            by = f"{'claimed' if printed.own else 'run by others'}: {printed.paper}, {printed.table}"
+            text = f"{_psnr_and_speed(printed.values)} ({by}, {printed.data}, grade {printed.grade})"
+            lines.append(f"Printed: {text}")
         measured = measured_figures(name)
         lines += [f"Measured: {measured_text(measured)}"] if measured else []
         lines += [spec.bibtex.strip()] if spec.bibtex else []
         text = "\n".join(lines).replace("\n", "\n  ")
-        cards.append(
-            {
-                "name": name,
-                "error": "",
-                "summary": f"{text}\n",
-                "source": spec.source,
-                "bibtex": spec.bibtex.strip(),
-                "native": spec.native,
-                "printed": [vars(figure) for figure in figures],
-                "measured": vars(measured) if measured else None,
-            }
-        )
+        card: dict[str, Any] = {"name": name, "error": "", "summary": f"{text}\n", "source": spec.source}
+        card |= {"bibtex": spec.bibtex.strip(), "native": spec.native}
+        card["printed"] = [vars(figure) for figure in figures]
+        cards.append({**card, "measured": vars(measured) if measured else None})
     return cards
 
 
 SHOWN = {"novel_view/psnr": "novel view", "self_reenactment/psnr": "self-reenactment", "fps": "speed"}
 UNITS = {"fps": "FPS"}
-
-
-def figure_text(figures: PrintedFigures) -> str:
-    """PSNR and speed of a published row as text, with the source."""
-    by = "claimed" if figures.own else "run by others"
-    return f"{_psnr_and_speed(figures.values)} ({by}: {figures.paper}, {figures.table}, {figures.data}, grade {figures.grade})"
 
 
 def measured_text(figures: MeasuredFigures) -> str:

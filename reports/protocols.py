@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import tyro
@@ -33,9 +34,8 @@ def under(runs: RunSet, name: str, protocol: NamedProtocol) -> RunSet:
     source = runs.runs[0].folder.rows
     tasks = tuple(task for task in protocol.tasks if task in runs.tasks)
     if not tasks:
-        raise InputError(
-            source, "tasks", f"{' or '.join(protocol.tasks)}, by protocol {name}", ", ".join(runs.tasks)
-        )
+        expected = f"{' or '.join(protocol.tasks)}, by protocol {name}"
+        raise InputError(source, "tasks", expected, ", ".join(runs.tasks))
     keys = {task: _frames(runs, task, protocol.tasks[task], name) for task in tasks}
     if protocol.region != FULL and protocol.region not in runs.rows.regions:
         expected = f"{protocol.region}, by protocol {name}"
@@ -48,16 +48,14 @@ def under(runs: RunSet, name: str, protocol: NamedProtocol) -> RunSet:
     if protocol.pooled is not None:
         rows = rows.pooled(protocol.pooled, {spec.name for spec in metrics if spec.unit == "dB"})
     # With one mean over all frames, sequences and timesteps of rows no longer identify frames.
-    found = {task: frozenset(own) for task, own in keys.items()} if protocol.average == "sequences" else {}
-    shown = " ".join([f"Protocol {name}: {protocol.title}.", *differences(runs, protocol)])
-    present = tuple(spec for spec in metrics if spec.name in rows.metrics)
-    selected = replace(runs, rows=rows, tasks=tasks, metrics=present, keys=found, part=shown)
-    return replace(selected, protocol=name, averaged=_averaged(protocol))
-
-
-def _averaged(protocol: NamedProtocol) -> str:
+    by_sequence = protocol.average == "sequences"
+    scored = {task: frozenset(frames) for task, frames in keys.items()} if by_sequence else {}
+    part = " ".join([f"Protocol {name}: {protocol.title}.", *differences(runs, protocol)])
+    measured = tuple(spec for spec in metrics if spec.name in rows.metrics)
     batches = "" if protocol.pooled is None else f"batches of {protocol.pooled} "
-    return f"{batches}{AVERAGED if protocol.average == 'sequences' else 'frames, then subjects'}"
+    averaged = f"{batches}{AVERAGED if by_sequence else 'frames, then subjects'}"
+    selected = replace(runs, rows=rows, tasks=tasks, metrics=measured, keys=scored, part=part)
+    return replace(selected, protocol=name, averaged=averaged)
 
 
 def _frames(runs: RunSet, task: str, wanted: TaskFrames, name: str) -> list[FrameKey]:
@@ -65,27 +63,25 @@ def _frames(runs: RunSet, task: str, wanted: TaskFrames, name: str) -> list[Fram
     source, keys = runs.runs[0].folder.rows, sorted(runs.keys[task])
     if wanted.cameras != "all" and task != "novel_view":  # cameras of novel views are unseen
         unseen, reason = unseen_cameras([run.manifest for run in runs.runs], keys)
-        inside = [
-            key for key in keys if ((key.subject, key.camera) in unseen) == (wanted.cameras == "unseen")
-        ]
+        hidden = wanted.cameras == "unseen"
+        inside = [key for key in keys if ((key.subject, key.camera) in unseen) == hidden]
         if not inside or not unseen:
             expected = f"{wanted.cameras} cameras in {task}, by protocol {name}"
-            raise InputError(
-                source, "cameras", expected, reason or f"{len({key.camera for key in keys})} others"
-            )
+            others = f"{len({key.camera for key in keys})} others"
+            raise InputError(source, "cameras", expected, reason or others)
         keys = inside
     if wanted.sequences:
-        of = sorted({key.sequence for key in keys})
+        sequences = sorted({key.sequence for key in keys})
         keys = [key for key in keys if key.sequence.startswith(wanted.sequences)]
         if not keys:
             expected = f"{' or '.join(wanted.sequences)}, held out, by protocol {name}"
-            raise InputError(source, "sequences", expected, ", ".join(of))
+            raise InputError(source, "sequences", expected, ", ".join(sequences))
     if wanted.last is not None:
         times: dict[tuple[str, str], list[int]] = {}
         for key in keys:
             times.setdefault((key.subject, key.sequence), []).append(key.timestep)
-        kept = {place: set(sorted(set(own))[-wanted.last :]) for place, own in times.items()}
-        keys = [key for key in keys if key.timestep in kept[key.subject, key.sequence]]
+        last = {place: set(sorted(set(of_place))[-wanted.last :]) for place, of_place in times.items()}
+        keys = [key for key in keys if key.timestep in last[key.subject, key.sequence]]
     return keys
 
 
@@ -111,30 +107,24 @@ def _metrics(runs: RunSet, name: str, protocol: NamedProtocol) -> tuple[list[Met
 
 def differences(runs: RunSet, protocol: NamedProtocol) -> list[str]:
     """Sentences on the differences of runs from the conditions of a protocol's published values."""
-    found = []
+    sentences = []
     synthetic = all(synthetic_settings(clip) for run in runs.runs for clip in run.manifest.clips)
     subjects = len({clip.subject for run in runs.runs for clip in run.manifest.clips})
     if protocol.subjects and synthetic:
-        found.append(f"Subjects: {subjects} synthetic; in the protocol: {protocol.subjects}.")
+        sentences.append(f"Subjects: {subjects} synthetic; in the protocol: {protocol.subjects}.")
     sizes = {p.resolution for run in runs.runs for p in run.manifest.protocols.values()}
     if protocol.size and sizes != {protocol.size}:
-        found.append(f"Pixels: {', '.join(sorted(sizes))}; in the protocol: {protocol.size}.")
-    budgets = sorted(
-        {
-            n
-            for record in runs.records.values()
-            if (n := record.budget.get("iterations")) and not record.trivial
-        }
-    )
+        sentences.append(f"Pixels: {', '.join(sorted(sizes))}; in the protocol: {protocol.size}.")
+    trained = (record.budget.get("iterations") for record in runs.records.values() if not record.trivial)
+    budgets = sorted({*filter(None, trained)})
     if protocol.iterations is not None and budgets and budgets != [protocol.iterations]:
         most = f"{budgets[0]:,}" + (f" to {budgets[-1]:,}" if len(budgets) > 1 else "")
-        found.append(f"Iterations: {most}; in the protocol: {protocol.iterations:,}.")
+        sentences.append(f"Iterations: {most}; in the protocol: {protocol.iterations:,}.")
     tracked = [label for label in runs.methods if label not in runs.with_refit]
     if protocol.test_refit and tracked:
-        found.append(
-            "Scored frames: as tracked; in the protocol: fitted to their own pictures (condition test-refit)."
-        )
-    return found
+        fitted = "fitted to their own pictures (condition test-refit)"
+        sentences.append(f"Scored frames: as tracked; in the protocol: {fitted}.")
+    return sentences
 
 
 @dataclass(frozen=True)
@@ -160,27 +150,24 @@ def choices(runs: RunSet) -> dict[str, NamedProtocol]:
         task: TaskFrames() for task in ("novel_view", "self_reenactment") if task in runs.tasks
     }
     usual = NamedProtocol("the usual one", "", tasks)
-    found = {USUAL: usual}
+    offered = {USUAL: usual}
     regions = sorted(runs.rows.regions - {FULL})
-    found |= {f"pixels: {region}": replace(usual, region=region) for region in regions}
+    offered |= {f"pixels: {region}": replace(usual, region=region) for region in regions}
     profiles = dict.fromkeys(spec.profile for spec in runs.metrics if spec.profile != CANONICAL)
-    found |= {f"metrics: {profile}": replace(usual, profile=profile) for profile in profiles}
-    found["pooled: 16 frames"] = replace(usual, pooled=16)
-    found["mean: over sequences"] = replace(usual, average="sequences")
+    offered |= {f"metrics: {profile}": replace(usual, profile=profile) for profile in profiles}
+    offered["pooled: 16 frames"] = replace(usual, pooled=16)
+    offered["mean: over sequences"] = replace(usual, average="sequences")
     if "self_reenactment" in tasks:
         starts = sorted({key.sequence.partition("-")[0] for key in runs.keys["self_reenactment"]})
         some = {f"cameras: {cameras}": TaskFrames(cameras) for cameras in ("seen", "unseen")}
         some |= {f"sequences: {start}": TaskFrames(sequences=(start,)) for start in starts if len(starts) > 1}
-        found |= {name: replace(usual, tasks={"self_reenactment": frames}) for name, frames in some.items()}
-    return found | {f"{NAMED}{name}": protocol for name, protocol in named_protocols().items()}
+        offered |= {name: replace(usual, tasks={"self_reenactment": frames}) for name, frames in some.items()}
+    return offered | {f"{NAMED}{name}": protocol for name, protocol in named_protocols().items()}
 
 
 @command("protocols", group="compare")
 def protocols_command(settings: ProtocolsSettings, progress: Progress) -> CommandResult:
-    """Show how each choice of an evaluation changes the results: pixels, metrics, cameras, means.
-
-    Raises `InputError` for runs that cannot be combined, and for unknown methods.
-    """
+    """Show how each choice of an evaluation changes the results: pixels, metrics, cameras, means."""
     if settings.out is not None:
         check_writable(Path(settings.out), "--out")
     runs = RunSet.read([Path(run) for run in settings.runs])
@@ -204,24 +191,14 @@ def choice_effects(
     refused: dict[str, str] = {}
     for label, protocol in choices(runs).items():
         try:
-            own = under(runs, label.removeprefix(NAMED), protocol)
+            selected = under(runs, label.removeprefix(NAMED), protocol)
         except InputError as error:
             refused[label] = f"{error.key}: expected {error.expected}"
             continue
-        values[label] = _means(own)
+        places = product(selected.methods, selected.tasks, QUALITY)
+        means = {(m, t, q): summarise(selected.rows, m, q, t).value for m, t, q in places}
+        values[label] = {" ".join(place): mean for place, mean in means.items() if mean is not None}
     return _text(runs.methods, values, refused, markdown=markdown), values, refused
-
-
-def _means(runs: RunSet) -> dict[str, float]:
-    """Mean of each metric by "method task metric"."""
-    found = {}
-    for method in runs.methods:
-        for task in runs.tasks:
-            for metric in QUALITY:
-                value = summarise(runs.rows, method, metric, task).value
-                if value is not None:
-                    found[f"{method} {task} {metric}"] = value
-    return found
 
 
 def _text(
@@ -240,16 +217,12 @@ def _text(
             continue
         head = ["" if markdown else "Choice", *(f"{method} {metric.upper()}" for method, metric in columns)]
         lines = []
-        for label, own in values.items():
+        for label, means in values.items():
             cells = []
             for method, metric in columns:
-                key = f"{method} {task} {metric}"
-                if key not in own:
-                    cells.append("–")
-                elif label == USUAL:
-                    cells.append(f"{own[key]:.{QUALITY[metric]}f}")
-                else:
-                    cells.append(f"{own[key] - base[key]:+.{QUALITY[metric]}f}")
+                key, digits = f"{method} {task} {metric}", QUALITY[metric]
+                subtracted, sign = (0.0, "") if label == USUAL else (base[key], "+")
+                cells.append(f"{means[key] - subtracted:{sign}.{digits}f}" if key in means else "–")
             if set(cells) != {"–"}:
                 lines.append([label, *cells])
         if markdown:
@@ -257,11 +230,10 @@ def _text(
             shown = f"### {TASK_TITLES[task]}\n\n{pipe_table([head, rule, *lines])}"
         else:
             shown = table(head, lines, title=TASK_TITLES[task])
-        spans = [
-            max(found) - min(found)
-            for m in methods
-            if (found := [own[key] for own in values.values() if (key := f"{m} {task} psnr") in own])
-        ]
+        by_method = (
+            [v[key] for v in values.values() if key in v] for key in (f"{m} {task} psnr" for m in methods)
+        )
+        spans = [max(means) - min(means) for means in by_method if means]
         spread = f"The PSNR of one method differs by up to {max(spans, default=0):.1f} dB between these rows."
         parts.append(f"{shown}\n\n{spread}")
     parts.append(
@@ -269,7 +241,6 @@ def _text(
         "differences from it: a protocol changes all of its choices, any other row one choice."
     )
     if refused:
-        parts.append(
-            "\n".join(["Not available from these rows:", "", *(f"- {k}: {v}" for k, v in refused.items())])
-        )
+        entries = (f"- {label}: {reason}" for label, reason in refused.items())
+        parts.append("\n".join(["Not available from these rows:", "", *entries]))
     return "\n\n".join(parts)

@@ -52,19 +52,9 @@ class RunData:
         return cls(folder, manifest, folder.read_rows(manifest))
 
     @property
-    def metrics(self) -> tuple[MetricSpec, ...]:
-        """Metrics of the run."""
-        return self.manifest.metrics
-
-    @property
     def methods(self) -> tuple[str, ...]:
         """Names of the methods."""
         return tuple(method.label for method in self.manifest.methods)
-
-    @property
-    def trivial(self) -> tuple[str, ...]:
-        """Names of the methods that are trivial baselines."""
-        return tuple(method.label for method in self.manifest.methods if method.trivial)
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -177,9 +167,7 @@ class RunSet:
     records: Mapping[str, MethodRecord]  # entries of the manifests, by label
     trivial: tuple[str, ...]  # labels of trivial baselines
     keys: Mapping[str, frozenset[FrameKey]]  # frames of each task in the protocol, also those without values
-    pictured: Mapping[
-        str, tuple[RunData, str]
-    ]  # by label, the run whose renders are shown, and the name there
+    pictured: Mapping[str, tuple[RunData, str]]  # run and name there of its renders, by label
     part: str = ""  # description of the part of the frames, "" for all
     cameras: str = ""  # sentence on seen and unseen cameras, "" before `by_camera`
     protocol: str = ""  # by which rows were chosen, see `protocols.under`
@@ -381,8 +369,7 @@ def unseen_cameras(
     manifests: Sequence[Manifest], keys: Collection[FrameKey]
 ) -> tuple[frozenset[tuple[str, str]], str]:
     """The (subject, camera) pairs of self-reenactment without training frames; none and a reason, one sentence, if
-    they are all, none, or not the same in all runs.
-    """
+    they are all, none, or not the same in all runs."""
     unseen, why = set(), ""
     cameras = {(key.subject, key.camera) for key in keys}
     for subject in {key.subject for key in keys}:
@@ -455,7 +442,7 @@ def _metrics(runs: Sequence[RunData]) -> tuple[MetricSpec, ...]:
     meaning = attrgetter("unit", "higher_is_better", "implementation", "detail")
     metrics: dict[str, MetricSpec] = {}
     for run in runs:
-        for spec in run.metrics:
+        for spec in run.manifest.metrics:
             if meaning(metrics.setdefault(spec.name, spec)) != meaning(spec):
                 expected = f"{spec.name} as in {runs[0].folder.root}"
                 raise InputError(run.folder.manifest, "metrics", expected, "another definition")

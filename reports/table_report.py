@@ -111,10 +111,7 @@ class ComparedRuns(RunSet):
 
 
 def read_runs(folders: Path | str | Sequence[Path | str]) -> ComparedRuns:
-    """Read finished runs on the same frames from one or more folders. Seeds of the same method with the same settings are merged.
-
-    Raises `InputError` if a folder is not a finished run, or the runs score different frames or protocols.
-    """
+    """Read finished runs on the same frames from one or more folders. Seeds of the same method with the same settings are merged."""
     paths = [folders] if isinstance(folders, (str, Path)) else folders
     return cast(ComparedRuns, ComparedRuns.read([Path(folder) for folder in paths]))
 

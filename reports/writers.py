@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ..bench import terminal
 from ..bench.io.provenance import tool
 from ..bench.io.style import SHAPES, escape_markdown, stylesheet
-from .tables import METHODS_TITLE, TITLES, Column, Table, TableCell, compact
+from .tables import METHODS_TITLE, TITLES, Table, TableCell, compact
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -71,7 +71,8 @@ def to_text(table: Table, *, details: bool = False, fit: bool = False) -> str:
     blocks = [warnings] if warnings else []
     for title in dict.fromkeys(column.title for column in table.columns):
         chosen = [i for i, column in enumerate(table.columns) if column.title == title]
-        heads = [_head(table.columns[i]) for i in chosen]
+        columns = [table.columns[i] for i in chosen]
+        heads = [f"{c.label}{f' ({c.unit})' if c.unit else ''} {c.arrow}" for c in columns]
         lines: list[list[str]] = []
         for group, rows in table.groups:
             lines += [[group]] if table.titled and group != METHODS_TITLE else []
@@ -80,11 +81,6 @@ def to_text(table: Table, *, details: bool = False, fit: bool = False) -> str:
     notes = [f"[{i}] {note}" for i, note in enumerate(table.notes, 1)]
     below = [*table.sentences(table.starred, details=details), *notes]
     return "\n\n".join([*blocks, "\n".join(map(terminal.wrapped, below) if fit else below)]) + "\n"
-
-
-def _head(column: Column) -> str:
-    unit = f" ({column.unit})" if column.unit else ""
-    return f"{column.label}{unit} {column.arrow}"
 
 
 def _text_cell(cell: TableCell) -> str:
@@ -190,11 +186,13 @@ def escape_latex(text: str) -> str:
     """Escape text for LaTeX, on one line; characters that pdfLaTeX's fonts lack become code points."""
 
     def escaped(match: re.Match[str]) -> str:
-        found = match[0]
-        if len(found) > 1:  # hyphens, which would become a dash
-            return "{}".join(found)
-        known = " " <= found <= "~" or ("À" <= found <= "ÿ" and found.isalpha() and found not in "ÐÞðþ")
-        return LATEX_ESCAPES.get(found, found if known else rf"\texttt{{U+{ord(found):04X}}}")
+        matched = match[0]
+        if len(matched) > 1:  # hyphens, which would become a dash
+            return "{}".join(matched)
+        printable = " " <= matched <= "~" or (
+            "À" <= matched <= "ÿ" and matched.isalpha() and matched not in "ÐÞðþ"
+        )
+        return LATEX_ESCAPES.get(matched, matched if printable else rf"\texttt{{U+{ord(matched):04X}}}")
 
     return re.sub("--+|.", escaped, unicodedata.normalize("NFC", " ".join(text.split())))
 

@@ -48,39 +48,34 @@ MEASURED: Mapping[str, tuple[str, float]] = {
 class CurvePoint:
     """A method trained with a part of its budget or of the frames, or with a level of tracking error.
 
-    ``place`` orders and identifies the points of a method. Values are means over seeds of one subject, or over subjects ("").
-    ``cameras``, ``timesteps`` and ``pictures`` count the training data. ``tracking_error`` is the level of a synthetic capture, None
-    for a recording. ``cost`` is `MEASURED` by name, ``values`` are the metrics by name and held-out data, such as "psnr_camera";
-    None: not measured. ``halves`` are half the widths of the 95 % intervals of means over subjects, by the same names, None with
-    fewer than `LEAST_SUBJECTS`.
+    Values are means over seeds of one subject, or over subjects (""); None: not measured.
     """
 
     method: str
     subject: str
-    place: tuple[float, ...]
+    place: tuple[float, ...]  # orders and identifies the points of a method
     part: Fraction
     budget: Budget
-    cameras: float
+    cameras: float  # number in the training data, likewise the next two
     timesteps: float
     pictures: float
-    tracking_error: float | None
-    cost: Mapping[str, float | None]
-    values: Mapping[str, float | None]
-    halves: Mapping[str, float | None]
+    tracking_error: float | None  # level of a synthetic capture, None for a recording
+    cost: Mapping[str, float | None]  # of `MEASURED`, by name
+    values: Mapping[str, float | None]  # by metric and held-out data, such as "psnr_camera"
+    halves: Mapping[str, float | None]  # half the 95 % interval over subjects; None below `LEAST_SUBJECTS`
 
     def flat(self) -> dict[str, object]:
         """The point as a line of ``curve.csv``, by column."""
         budget = asdict(self.budget)
+        counted = {
+            name: getattr(self, name) for name in ("cameras", "timesteps", "pictures", "tracking_error")
+        }
         return {
             "method": self.method,
             "subject": self.subject,
             "fraction": float(self.part),
-            "budget_iterations": budget["iterations"],
-            "budget_seconds": budget["seconds"],
-            "cameras": self.cameras,
-            "timesteps": self.timesteps,
-            "pictures": self.pictures,
-            "tracking_error": self.tracking_error,
+            **{f"budget_{name}": budget[name] for name in ("iterations", "seconds")},
+            **counted,
             **self.cost,
             **self.values,
         }
@@ -88,29 +83,26 @@ class CurvePoint:
 
 def mean(values: Sequence[float | None]) -> float | None:
     """Mean of numbers; None if any is missing or there are none."""
-    known = [value for value in values if value is not None]
-    return fmean(known) if known and len(known) == len(values) else None
+    present = [value for value in values if value is not None]
+    return fmean(present) if present and len(present) == len(values) else None
 
 
 def _half_width(values: Sequence[float | None]) -> float | None:
     """Half the width of the interval of a mean; None for fewer than `LEAST_SUBJECTS` numbers or a missing one."""
-    known = [value for value in values if value is not None]
-    return half_width(known) if LEAST_SUBJECTS <= len(known) == len(values) else None
+    present = [value for value in values if value is not None]
+    return half_width(present) if LEAST_SUBJECTS <= len(present) == len(values) else None
 
 
 def mean_point(points: Sequence[CurvePoint]) -> CurvePoint:
     """The mean over subjects of points that are otherwise equal."""
     first = points[0]
     by_name = {key: [point.values[key] for point in points] for key in first.values}
-    cameras, timesteps, pictures = (
-        fmean(getattr(point, name) for point in points) for name in ("cameras", "timesteps", "pictures")
-    )
+    names = ("cameras", "timesteps", "pictures")
+    counts: dict[str, Any] = {name: fmean(getattr(point, name) for point in points) for name in names}
     return replace(
         first,
+        **counts,
         subject="",
-        cameras=cameras,
-        timesteps=timesteps,
-        pictures=pictures,
         cost={key: mean([point.cost[key] for point in points]) for key in first.cost},
         values={key: mean(values) for key, values in by_name.items()},
         halves={key: _half_width(values) for key, values in by_name.items()},
@@ -122,50 +114,42 @@ def column(spec: MetricSpec, task: str) -> str:
     return f"{spec.name}_{HELD_OUT[task]}" if task in HELD_OUT else spec.name
 
 
-def points_text(
-    points: Sequence[CurvePoint],
-    metrics: Sequence[MetricSpec],
-    tasks: Sequence[str],
-    held: Mapping[str, Mapping[str, Any]],
-    missing: Mapping[str, str],
-    failed: Sequence[str],
-) -> str:
+def points_text(curve: CurveData, failed: Sequence[str]) -> str:
     """Means over subjects as a table, with the held-out data and the missing values."""
-    frame = [spec for spec in metrics if spec.per_frame]
-    costs = {name for name, _ in MEASURED.values()}
-    avatar = [spec for spec in metrics if not spec.per_frame and spec.name not in costs]
-    tracked = any(point.tracking_error is not None for point in points)
+    frame, costs = curve.of_frames, {name for name, _ in MEASURED.values()}
+    avatar = [spec for spec in curve.metrics if not spec.per_frame and spec.name not in costs]
+    tracked = any(point.tracking_error is not None for point in curve.means)
     place = ["method", "part", "budget"]
     heads = [*place, "cameras", "timesteps", "pictures", *["tracking"] * tracked, "CPU s", "s"]
     heads += [f"{spec.label} {spec.unit}".rstrip() for spec in avatar]
     trainings: list[list[str]] = []
-    quality: dict[str, list[list[str]]] = {task: [] for task in tasks if frame}
-    for point in points:
+    quality: dict[str, list[list[str]]] = {task: [] for task in curve.tasks if frame}
+    for point in curve.means:
         budget = point.budget
         size = f"{budget.seconds:g} s" if budget.iterations is None else f"{budget.iterations}"
         where = [point.method, str(point.part), size]
         cells = [f"{count:g}" for count in (point.cameras, point.timesteps, point.pictures)]
-        cells += [_shown(point.tracking_error, 2)] * tracked
-        cells += [_shown(point.cost[key], 1) for key in ("processor_seconds", "seconds")]
-        cells += [_shown(point.values[spec.name], spec.digits) for spec in avatar]
+        cells += [_text(point.tracking_error, 2)] * tracked
+        cells += [_text(point.cost[key], 1) for key in ("processor_seconds", "seconds")]
+        cells += [_text(point.values[spec.name], spec.digits) for spec in avatar]
         trainings.append([*where, *cells])
-        for task, own in quality.items():
-            own.append([*where, *(_shown(point.values[column(spec, task)], spec.digits) for spec in frame)])
+        for task, rows in quality.items():
+            rows.append([*where, *(_text(point.values[column(spec, task)], spec.digits) for spec in frame)])
     lines = [table(heads, trainings, names=3, title="Trainings"), ""]
-    for task, own in quality.items():
+    for task, rows in quality.items():
         title = f"Quality, held-out {HELD_OUT[task]}"
-        lines += [table([*place, *(spec.label for spec in frame)], own, names=3, title=title), ""]
+        lines += [table([*place, *(spec.label for spec in frame)], rows, names=3, title=title), ""]
     lines.append("Means over subjects. Held out of every training; no test frame was used:")
-    for subject, parameters in held.items():
-        steps = ", ".join(map(str, parameters["timesteps"][:6])) + (
-            ", ..." if len(parameters["timesteps"]) > 6 else ""
-        )
+    for subject in curve.subjects:
+        parameters = curve.held_out[subject]
+        timesteps = parameters["timesteps"]
+        steps = ", ".join([*map(str, timesteps[:6]), *(["..."] if len(timesteps) > 6 else [])])
         lines.append(f"  {subject}: camera {parameters['camera'] or 'none'}, timesteps {steps or 'none'}")
-    lines += [f"{label} missing: {reason}" for label, reason in missing.items()]
+    lines += [f"{label} missing: {reason}" for label, reason in curve.missing.items()]
     return "\n".join([*lines, *(f"failed: {name}" for name in failed)])
 
 
-def _shown(value: float | None, digits: int) -> str:
+def _text(value: float | None, digits: int) -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
@@ -177,10 +161,8 @@ class CurveReportSettings:
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders that `headbench run curve` wrote."""
-
     out: str
     """Folder to write: curve.csv and curve.png."""
-
     over: Over = "budget"
     """What the trainings differ in, as for `headbench run curve`."""
 
@@ -199,22 +181,15 @@ GRID = 600
 class Leader:
     """A method that has the best mean from a certain cost on.
 
-    Attributes
-    ----------
-    start : float
-        Lowest cost at which the method is best: where its curve crosses that of the previous leader, or its lowest cost.
-    interval : tuple[float | None, float | None] | None
-        Costs around ``start`` at which the 95 % interval of the paired difference of both methods contains 0; an end
-        beyond the measured costs is None. None instead of a pair for the first leader, for a method that is best from its
-        lowest cost on without a crossing, and with too few subjects for an interval.
-    measured : tuple[float, float]
-        The lowest and the highest cost at which the method and the previous leader have values.
+    ``interval`` are the costs around ``start`` at which the 95 % interval of the paired difference to the previous leader
+    contains 0; an end beyond the measured costs is None. None instead of a pair for the first leader, for a method that is best
+    from its lowest cost on without a crossing, and with too few subjects.
     """
 
     method: str
-    start: float
+    start: float  # where its curve crosses that of the previous leader, or its lowest cost
     interval: tuple[float | None, float | None] | None
-    measured: tuple[float, float]
+    measured: tuple[float, float]  # lowest and highest cost at which it and the previous leader have values
 
     def text(self) -> str:
         """Method, cost and interval, such as "`ga` from 11 [8.2, above 120]"."""
@@ -239,43 +214,39 @@ def leaders(lines: Lines, *, higher_is_better: bool) -> list[Leader]:
     spaced = np.geomspace if min(costs) > 0 else np.linspace
     grid = spaced(min(costs), max(costs), GRID)
     sign = 1.0 if higher_is_better else -1.0
-    values = {name: sign * _values(own, subjects, grid) for name, own in lines.items()}
-    means = np.stack([each.mean(0) for each in values.values()])
+    scale = np.log if grid[0] > 0 else np.positive
+    values = {}  # by method, (S, G) qualities of the subjects at the costs of the grid; NaN below their lowest cost
+    for name, line in lines.items():
+        pairs = [np.array(sorted(line[subject])).T for subject in subjects]
+        curves = [np.interp(scale(grid), scale(cost), value, left=np.nan) for cost, value in pairs]
+        values[name] = sign * np.stack(curves)
+    means = np.stack([curves.mean(0) for curves in values.values()])
     names = list(values)
     best = np.where(np.isnan(means), -np.inf, means).argmax(0)
-    known = np.isfinite(means).any(0)
-    found: list[Leader] = []
+    measured = np.isfinite(means).any(0)
+    leading: list[Leader] = []
     for place in range(GRID):
         name = names[best[place]]
-        if not known[place] or (found and found[-1].method == name):
+        if not measured[place] or (leading and leading[-1].method == name):
             continue
-        compared = [lines[name], *(lines[leader.method] for leader in found[-1:])]
-        lowest = max(min(own[subject])[0] for own in compared for subject in subjects)
+        compared = [lines[name], *(lines[leader.method] for leader in leading[-1:])]
+        lowest = max(min(line[subject])[0] for line in compared for subject in subjects)
         around = None
-        if found and np.isfinite(values[name][:, place - 1]).all():
-            around = _around(values[name] - values[found[-1].method], place, grid)
-        found.append(Leader(name, float(grid[place]), around, (lowest, max(costs))))
-    return found
-
-
-def _values(
-    own: Mapping[str, Sequence[tuple[float, float]]], subjects: Sequence[str], grid: FloatArray
-) -> FloatArray:
-    """(S, G) qualities of the subjects at the costs of the grid; NaN below the lowest cost of any."""
-    scale = np.log if grid[0] > 0 else np.positive
-    pairs = [np.array(sorted(own[subject])).T for subject in subjects]
-    return np.stack([np.interp(scale(grid), scale(cost), value, left=np.nan) for cost, value in pairs])
+        if leading and np.isfinite(values[name][:, place - 1]).all():
+            around = _around(values[name] - values[leading[-1].method], place, grid)
+        leading.append(Leader(name, float(grid[place]), around, (lowest, max(costs))))
+    return leading
 
 
 def _around(change: FloatArray, place: int, grid: FloatArray) -> tuple[float | None, float | None] | None:
     """Costs between which the interval of the mean ``change``, (S, G), contains 0, around a place of the grid."""
     # A method has no value below its lowest cost, and so no interval there.
-    bounds = [interval(each.tolist()) if np.isfinite(each).all() else None for each in change.T]
+    bounds = [interval(changes.tolist()) if np.isfinite(changes).all() else None for changes in change.T]
     if bounds[place] is None:
         return None
-    apart = [each is not None and (each[0] > 0 or each[1] < 0) for each in bounds]
-    low = next((float(grid[i]) for i in range(place - 1, -1, -1) if apart[i]), None)
-    high = next((float(grid[i]) for i in range(place, len(grid)) if apart[i]), None)
+    different = [ends is not None and (ends[0] > 0 or ends[1] < 0) for ends in bounds]
+    low = next((float(grid[i]) for i in range(place - 1, -1, -1) if different[i]), None)
+    high = next((float(grid[i]) for i in range(place, len(grid)) if different[i]), None)
     return low, high
 
 
@@ -338,71 +309,50 @@ def curve_report(out: Path, over: str) -> CommandResult:
 def curve_runs(settings: CurveReportSettings, progress: Progress = no_progress) -> CommandResult:
     """Join runs of `headbench run curve`: means over subjects, and the best method for each cost of a
     training."""
-    runs, out = [RunData.read(Path(run)) for run in settings.runs], Path(settings.out)
-    return joined_curve(runs, settings.over, out)
+    runs = [RunData.read(Path(run)) for run in settings.runs]
+    return joined_curve(runs, settings.over, Path(settings.out))
 
 
 def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult:
-    """Write ``curve.csv`` and ``curve.png`` of runs; return points, a table of their means, and the best method by cost.
-
-    Raises `InputError` as `read_curve` does.
-    """
+    """Write ``curve.csv`` and ``curve.png`` of runs; return points, a table of their means, and the best method by cost."""
     curve = read_curve(runs, over)
     out.mkdir(parents=True, exist_ok=True)
-    write_text(out / "curve.csv", csv_text(_lines(curve.points)))
+    records = [point.flat() for point in curve.points]
+    write_text(out / "curve.csv", csv_text([[*records[0]], *([*record.values()] for record in records)]))
     write_curve(out / "curve.png", curve)
     failed = [name for run in runs for name in run.rows.failed]
     data = {
         "out": out,
         "held_out": curve.held_out,
-        "points": [point.flat() for point in curve.points],
+        "points": records,
         "best": [
             {"metric": metric, "held_out": HELD_OUT[task], **asdict(leader)}
-            for (metric, task), found in curve.best.items()
-            for leader in found
+            for (metric, task), leading in curve.best.items()
+            for leader in leading
         ],
         "missing": curve.missing,
         "failed": failed,
     }
-    held_out = {subject: curve.held_out[subject] for subject in curve.subjects}
-    text = points_text(curve.means, curve.metrics, curve.tasks, held_out, curve.missing, failed)
     written = f"Written: {out / 'curve.csv'}, {out / 'curve.png'}"
-    return CommandResult(f"{text}\n\n{leaders_text(curve, markdown=False)}\n\n{written}", data, not failed)
+    text = "\n\n".join([points_text(curve, failed), leaders_text(curve, markdown=False), written])
+    return CommandResult(text, data, not failed)
 
 
 @dataclass(frozen=True)
 class CurveData:
-    """Trainings that differ in one quantity.
-
-    Attributes
-    ----------
-    subjects : Sequence[str]
-        Subjects that all methods have, over which the means are taken.
-    points, means : Sequence[CurvePoint]
-        All trainings, by method, quantity and subject; and the means over subjects.
-    clock : str
-        The cost in `MEASURED` that measures training time on the device.
-    best : Mapping[tuple[str, str], Sequence[Leader]]
-        Result of `leaders` by name of a frame metric and task.
-    every : int
-        One of this many consecutive training timesteps is held out.
-    held_out : Mapping[str, Mapping[str, Any]]
-        Held-out camera and timesteps, and the remaining training data, by subject.
-    missing : Mapping[str, str]
-        Reasons by label of a metric that was not measured.
-    """
+    """Trainings that differ in one quantity."""
 
     over: str
-    subjects: Sequence[str]
-    points: Sequence[CurvePoint]
-    means: Sequence[CurvePoint]
+    subjects: Sequence[str]  # that all methods have, over which the means are taken
+    points: Sequence[CurvePoint]  # all trainings, by method, quantity and subject
+    means: Sequence[CurvePoint]  # over subjects
     metrics: Sequence[MetricSpec]
     tasks: Sequence[str]
-    clock: str
-    best: Mapping[tuple[str, str], Sequence[Leader]]
-    every: int
-    held_out: Mapping[str, Mapping[str, Any]]
-    missing: Mapping[str, str]
+    clock: str  # the cost in `MEASURED` that measures training time on the device
+    best: Mapping[tuple[str, str], Sequence[Leader]]  # by name of a frame metric and task
+    every: int  # one of this many consecutive training timesteps is held out
+    held_out: Mapping[str, Mapping[str, Any]]  # camera and timesteps, and remaining training data, by subject
+    missing: Mapping[str, str]  # reasons by label of a metric that was not measured
 
     @property
     def of_frames(self) -> list[MetricSpec]:
@@ -417,25 +367,10 @@ class CurveData:
 
 
 def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
-    """Read the trainings of runs, which differ in one quantity.
-
-    Parameters
-    ----------
-    runs : Sequence[RunData]
-        Runs of the same kind of curve, with several methods or subjects.
-    over : str
-        Quantity that varies between the trainings: "budget", "seconds", "cameras", "timesteps", "pictures" or
-        "tracking_error".
-
-    Raises
-    ------
-    InputError
-        A folder is not a run of such a curve, two have the same training, they differ in device, preset, image size, seeds,
-        metrics or held-out frames, or no subject has all methods.
-    """
+    """Read the trainings of runs of the same kind of curve, which differ in the quantity ``over``."""
     points = [point for run in runs for point in _points(run, over)]
     _check_together(runs, points)
-    tasks, metrics = runs[0].tasks, runs[0].metrics
+    tasks, metrics = runs[0].tasks, runs[0].manifest.metrics
     names = list(dict.fromkeys(point.method for point in points))
     order = list(dict.fromkeys(point.subject for point in points))
     trained = {(point.method, point.subject) for point in points}
@@ -471,10 +406,7 @@ def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
 def write_curve(path: Path, curve: CurveData) -> None:
     """Draw the means as a PNG: a row of plots for each task, a plot for each frame metric."""
     axis = curve.clock if curve.over in TIMED else curve.over
-    rows = [
-        [_panel(curve.means, spec, task, axis, curve.missing) for spec in curve.of_frames]
-        for task in curve.tasks
-    ]
+    rows = [[_panel(curve, spec, task, axis) for spec in curve.of_frames] for task in curve.tasks]
     left_out = {
         "novel_view": "a training camera",
         "self_reenactment": f"one of {curve.every} consecutive training timesteps",
@@ -493,11 +425,10 @@ def _points(run: RunData, over: str) -> list[CurvePoint]:
     """The trainings of a run that differ in ``over``. Raises `InputError` where there are none."""
     config = run.manifest.configuration
     conditions = {condition.name: condition for condition in config.conditions}
-    quantities = (
-        {name: _quantity(each) for name, each in conditions.items()}
-        if "every" in config.clip.parameters
-        else {}
-    )
+    quantities = {}
+    for name, condition in conditions.items() if "every" in config.clip.parameters else ():
+        of_budget = "seconds" if condition.budget.endswith(" s") else "budget"
+        quantities[name] = condition.clip.name.replace("-", "_") or of_budget
     points = [
         _point(run, record, conditions[record.condition], clip)
         for record in run.manifest.methods
@@ -506,19 +437,10 @@ def _points(run: RunData, over: str) -> list[CurvePoint]:
     ]
     if not points:
         expected = f"trainings of `headbench run curve --over {over}`"
-        others = sorted(
-            {quantities[each.condition] for each in run.manifest.methods if each.condition in quantities}
-        )
-        found = f"trainings of --over {' and '.join(others)}" if others else "none"
-        raise InputError(run.folder.manifest, "configuration", expected, found)
+        others = sorted({quantities[m.condition] for m in run.manifest.methods if m.condition in quantities})
+        instead = f"trainings of --over {' and '.join(others)}" if others else "none"
+        raise InputError(run.folder.manifest, "configuration", expected, instead)
     return points
-
-
-def _quantity(condition: Condition) -> str:
-    """The quantity that a condition of a curve changes."""
-    return condition.clip.name.replace("-", "_") or (
-        "seconds" if condition.budget.endswith(" s") else "budget"
-    )
 
 
 def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> None:
@@ -529,14 +451,14 @@ def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> No
     for run in runs:
         place, other = run.folder.manifest, run.manifest
         for name in ("device", "preset", "divide", "seeds"):
-            expected, found = (str(getattr(each.configuration, name)) for each in (first, other))
-            if found != expected:
-                raise InputError(place, name, expected, found)
+            expected, value = (str(getattr(m.configuration, name)) for m in (first, other))
+            if value != expected:
+                raise InputError(place, name, expected, value)
         if other.metrics != first.metrics:
             raise InputError(place, "metrics", f"those of {runs[0].folder.root}", "others")
-        every = [each.configuration.clip.parameters["every"] for each in (first, other)]
-        if every[1] != every[0]:
-            raise InputError(place, "every", str(every[0]), str(every[1]))
+        expected, value = (str(m.configuration.clip.parameters["every"]) for m in (first, other))
+        if value != expected:
+            raise InputError(place, "every", expected, value)
         for record in other.methods:
             version = versions.setdefault(record.name, record.version)
             if record.version != version:
@@ -544,8 +466,8 @@ def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> No
         if run.tasks != runs[0].tasks:
             raise InputError(place, "tasks", ", ".join(runs[0].tasks), ", ".join(run.tasks))
         for task, subject in product(run.tasks, run.rows.subjects):
-            own = {key for key in run.keys(task) if key.subject == subject}
-            if own != frames.setdefault((task, subject), own):
+            keys = {key for key in run.keys(task) if key.subject == subject}
+            if keys != frames.setdefault((task, subject), keys):
                 expected = f"the held-out frames of {subject} in the other runs"
                 raise InputError(place, f"protocol of {task}", expected, "others")
     trained = Counter((point.method, point.subject, point.place) for point in points)
@@ -567,7 +489,7 @@ def _leaders(
     points: Sequence[CurvePoint], metrics: Sequence[MetricSpec], tasks: Sequence[str], axis: str
 ) -> dict[tuple[str, str], list[Leader]]:
     """`leaders` by name of a frame metric and task; methods with a failed training are excluded."""
-    found = {}
+    by_column = {}
     for spec, task in product((spec for spec in metrics if spec.per_frame), tasks):
         lines: dict[str, dict[str, list[tuple[float, float]]]] = {}
         # A line must not skip a failed training.
@@ -576,8 +498,8 @@ def _leaders(
             cost, value = _cost(point, axis), point.values[column(spec, task)]
             if cost is not None and value is not None:
                 lines.setdefault(point.method, {}).setdefault(point.subject, []).append((cost, value))
-        found[spec.name, task] = leaders(lines, higher_is_better=spec.higher_is_better)
-    return found
+        by_column[spec.name, task] = leaders(lines, higher_is_better=spec.higher_is_better)
+    return by_column
 
 
 def leaders_text(curve: CurveData, *, markdown: bool = True) -> str:
@@ -590,11 +512,9 @@ def leaders_text(curve: CurveData, *, markdown: bool = True) -> str:
     rule = ["---"] * (1 + len(heads))
     shown = pipe_table([["", *heads], rule, *lines]) if markdown else table(["metric", *heads], lines)
     taken = "limit of seconds" if curve.over == "seconds" else curve.axis.lower()
-    crossings = (
-        "95 % interval of each crossing in brackets"
-        if len(curve.subjects) >= LEAST_SUBJECTS
-        else f"without intervals, which need {LEAST_SUBJECTS} subjects"
-    )
+    crossings = "95 % interval of each crossing in brackets"
+    if len(curve.subjects) < LEAST_SUBJECTS:
+        crossings = f"without intervals, which need {LEAST_SUBJECTS} subjects"
     return (
         f"Methods with the best mean, each with the {taken} from which it leads (interpolated between trainings, {crossings}):"
         f"\n\n{shown}"
@@ -603,35 +523,30 @@ def leaders_text(curve: CurveData, *, markdown: bool = True) -> str:
 
 def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipRecord) -> CurvePoint:
     values: dict[str, float | None] = {}
-    for spec in run.metrics:
+    for spec in run.manifest.metrics:
         for task in run.tasks if spec.per_frame else ("",):
             chosen = run.rows.select(
                 method=record.label, metric=spec.name, task=task, region=FULL, seeds=ALL, subject=clip.subject
             )
             whole = len(chosen) and (chosen["status"] == "ok").all()
             values[column(spec, task)] = subject_means(chosen)[clip.subject] if whole else None
-    known = {key: (values.pop(metric, None), factor) for key, (metric, factor) in MEASURED.items()}
-    cost = {key: None if value is None else factor * value for key, (value, factor) in known.items()}
-    added = next(
-        (a.steps for a in run.manifest.adapted if (a.subject, a.method) == (clip.subject, record.label)), []
-    )
-    given = {**_step(clip.steps, "hold_out")["training"], **_step(added, "reduce_training")}
+    measured = {key: (values.pop(metric, None), factor) for key, (metric, factor) in MEASURED.items()}
+    cost = {key: None if value is None else factor * value for key, (value, factor) in measured.items()}
+    adapted = (a for a in run.manifest.adapted if (a.subject, a.method) == (clip.subject, record.label))
+    reduced = _step(next((a.steps for a in adapted), []), "reduce_training")
+    training = {**_step(clip.steps, "hold_out")["training"], **reduced}
     part = condition.part if condition.part != 1 else Fraction(condition.clip.parameters.get("part", "1"))
     budget, level = Budget(**record.budget), condition.clip.parameters.get("level")
-    asked = float(condition.clip.parameters.get("count", 0))
+    place = float(part), budget.seconds or 0.0, float(condition.clip.parameters.get("count", 0)), level or 0.0
     return CurvePoint(
-        record.name,
-        clip.subject,
-        (float(part), budget.seconds or 0.0, asked, level or 0.0),
-        part,
-        budget,
-        len(given["cameras"]),
-        len(given["timesteps"]),
-        given.get("count", clip.splits["train"]),
-        tracking_error(clip.steps) if level is None else level,
-        cost,
-        values,
-        {},
+        *(record.name, clip.subject, place, part, budget),
+        cameras=len(training["cameras"]),
+        timesteps=len(training["timesteps"]),
+        pictures=training.get("count", clip.splits["train"]),
+        tracking_error=tracking_error(clip.steps) if level is None else level,
+        cost=cost,
+        values=values,
+        halves={},
     )
 
 
@@ -642,17 +557,15 @@ def _step(steps: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:
 
 def _reason(rows: Rows, spec: MetricSpec) -> str:
     """Reason why a metric was not measured; "" if it was, or if trainings failed."""
-    own = rows.select(method=ALL, metric=spec.name, task=ALL, region=FULL, seeds=ALL)
-    reasons = own.loc[own["status"] == "missing", "reason"]
+    values = rows.select(method=ALL, metric=spec.name, task=ALL, region=FULL, seeds=ALL)
+    reasons = values.loc[values["status"] == "missing", "reason"]
     return " ".join(str(reasons.iloc[0]).split()) if len(reasons) else ""
 
 
-def _panel(
-    points: Sequence[CurvePoint], spec: MetricSpec, task: str, axis: str, missing: Mapping[str, str]
-) -> CurvePanel:
+def _panel(curve: CurveData, spec: MetricSpec, task: str, axis: str) -> CurvePanel:
     """Quality over the horizontal axis: a field of `CurvePoint` or a cost."""
     lines: dict[str, list[tuple[float, float, float]]] = {}
-    for point in points:
+    for point in curve.means:
         cost = _cost(point, axis)
         value, half = point.values[column(spec, task)], point.halves[column(spec, task)]
         line = lines.setdefault(point.method, [])
@@ -661,9 +574,4 @@ def _panel(
             line.append((cost, value, half or 0.0))
     unit = f", {spec.unit}" if spec.unit else ""
     title = f"{spec.label}{unit}, held-out {HELD_OUT[task]}"
-    return CurvePanel(title, lines, missing.get(spec.label, ""))
-
-
-def _lines(points: Sequence[CurvePoint]) -> list[list[object]]:
-    flat = [point.flat() for point in points]
-    return [[*flat[0]], *([*line.values()] for line in flat)]
+    return CurvePanel(title, lines, curve.missing.get(spec.label, ""))

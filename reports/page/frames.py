@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import groupby, zip_longest
+from itertools import groupby, product, zip_longest
 from threading import Lock
 from typing import NamedTuple
 
@@ -44,31 +44,26 @@ class ShownFrame(NamedTuple):
 
 @dataclass
 class Pictures:
-    """Images of frames: for each frame the ground truth, then each method, as a base64 WebP or a reason.
-
-    ``lossless`` are frames with lossless images. ``truth`` is the reason why the ground truth is missing,
-    or "".
-    """
+    """Images of frames: for each frame the ground truth, then each method, as a base64 WebP or a reason."""
 
     shown: dict[ShownFrame, list[str | None]] = field(default_factory=dict)
     reasons: dict[ShownFrame, list[str]] = field(default_factory=dict)
     lossless: set[ShownFrame] = field(default_factory=set)
     first_cameras_lossless: bool = True
-    truth: str = ""
+    truth: str = ""  # the reason why the ground truth is missing, or ""
     bytes: int = 0
 
 
 def frame_values(runs: RunSet, metrics: Sequence[MetricSpec]) -> dict[tuple[str, str, ShownFrame], float]:
     """Values of the displayed whole images, by metric, label and frame."""
-    found = {}
-    for task in runs.tasks:
-        for key in runs.keys[task]:
-            for label, (run, name) in runs.pictured.items():
-                for spec in metrics:
-                    value = run.value(spec.name, name, task, key)
-                    if value is not None:
-                        found[spec.name, label, ShownFrame(task, key)] = value
-    return found
+    return {
+        (spec.name, label, ShownFrame(task, key)): value
+        for task in runs.tasks
+        for key in runs.keys[task]
+        for label, (run, name) in runs.pictured.items()
+        for spec in metrics
+        if (value := run.value(spec.name, name, task, key)) is not None
+    }
 
 
 def worst_frames(
@@ -78,18 +73,15 @@ def worst_frames(
 
     Trivial baselines are skipped unless there are no other methods.
     """
-    found: dict[ShownFrame, None] = {}
+    worst: dict[ShownFrame, None] = {}
     sign = 1 if spec.higher_is_better else -1
-    for label in runs.ranked or runs.methods:
-        for task in runs.tasks:
-            own = [
-                (sign * v, f) for (m, n, f), v in values.items() if (m, n, f.task) == (spec.name, label, task)
-            ]
-            moments: dict[tuple[str, str, int], ShownFrame] = {}
-            for _, frame in sorted(own):
-                moments.setdefault(frame.key[:3], frame)
-            found.update(dict.fromkeys([*moments.values()][:count]))
-    return [*found]
+    for place in product((spec.name,), runs.ranked or runs.methods, runs.tasks):
+        scores = [(sign * v, f) for (m, n, f), v in values.items() if (m, n, f.task) == place]
+        moments: dict[tuple[str, str, int], ShownFrame] = {}
+        for _, frame in sorted(scores):
+            moments.setdefault(frame.key[:3], frame)
+        worst.update(dict.fromkeys([*moments.values()][:count]))
+    return [*worst]
 
 
 def spread(frames: Sequence[ShownFrame]) -> Iterator[ShownFrame]:
@@ -137,10 +129,7 @@ def encode(image: ByteArray, quality: int) -> str:
 def choose_pictures(
     runs: RunSet, worst: Sequence[ShownFrame], budget: int, options: RunOptions, progress: Progress
 ) -> Pictures:
-    """Encode the worst frames, then others as long as they fit in ``budget`` bytes of base64.
-
-    Raises `InputError` if the worst ones do not fit.
-    """
+    """Encode the worst frames, which have to fit in ``budget`` bytes of base64, then others as long as they fit."""
     clips, why = open_truth(runs, options)
     pictures = Pictures(truth=why)
     source = _Source(runs, clips, why)
@@ -155,9 +144,8 @@ def choose_pictures(
             nonlocal done
             for start in range(0, len(frames), BATCH):
                 batch, of_batch = frames[start : start + BATCH], qualities[start : start + BATCH]
-                for frame, quality, (images, reasons) in zip(
-                    batch, of_batch, pool.map(source.read, batch, of_batch)
-                ):
+                read = pool.map(source.read, batch, of_batch)
+                for frame, quality, (images, reasons) in zip(batch, of_batch, read):
                     size = sum(len(image) + 3 for image in images if image is not None)
                     if pictures.bytes + size > limit:
                         return False
@@ -173,11 +161,11 @@ def choose_pictures(
             pictures = Pictures(truth=why, first_cameras_lossless=False)
             done = 0
             if not add(worst, [LOSSY] * len(worst), budget):
-                shown = f"{len(pictures.shown)} of {len(worst)} fit"
-                raise InputError("command line", "--max-mb", f"room for the {len(worst)} worst frames", shown)
+                fit = f"{len(pictures.shown)} of {len(worst)} fit"
+                raise InputError("command line", "--max-mb", f"room for the {len(worst)} worst frames", fit)
         elif worst:
-            own = sum(frame.key.camera == first_cameras[frame.task] for frame in rest)
-            pictures.first_cameras_lossless = pictures.bytes * (1 + own / len(worst)) <= budget / 2
+            others = sum(frame.key.camera == first_cameras[frame.task] for frame in rest)
+            pictures.first_cameras_lossless = pictures.bytes * (1 + others / len(worst)) <= budget / 2
         exact = {f for f in rest if pictures.first_cameras_lossless and f.key.camera == first_cameras[f.task]}
         add(rest, [LOSSLESS if frame in exact else LOSSY for frame in rest], budget)
     progress(len(every), len(every), "pictures")
@@ -259,18 +247,16 @@ def opening(
     which values of the first metric differ most; if there is none, the first frame with any image.
     """
     place = {label: index + 1 for index, label in enumerate(runs.methods)}
-    drawn = {
-        label for label in place for images in pictures.shown.values() if images[place[label]] is not None
-    }
+    drawn = {label for label, i in place.items() if any(images[i] for images in pictures.shown.values())}
     offered = [label for label in (*best, *runs.ranked, *runs.methods) if label in drawn]
     chosen = tuple(dict.fromkeys(offered))[:TILES] or (*best, *runs.methods)[:TILES]
     spreads: dict[ShownFrame, float] = {}
     for frame, images in sorted(pictures.shown.items()):
-        own = [values.get((metrics[0].name, label, frame)) for label in chosen] if metrics else []
-        known = [value for value in own if value is not None]
+        scores = [values.get((metrics[0].name, label, frame)) for label in chosen] if metrics else []
+        present = [value for value in scores if value is not None]
         complete = all(images[index] is not None for index in (0, *(place[label] for label in chosen)))
-        if complete and known and len(known) == len(chosen) and frame.task == runs.tasks[0]:
-            spreads[frame] = max(known) - min(known)
+        if complete and present and len(present) == len(chosen) and frame.task == runs.tasks[0]:
+            spreads[frame] = max(present) - min(present)
     if spreads:
         return Opening(chosen, max(spreads, key=lambda frame: spreads[frame]))
     first = (f for f in sorted(pictures.shown) if any(image is not None for image in pictures.shown[f]))

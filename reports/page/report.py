@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
@@ -28,7 +28,7 @@ from ..drawing import colour_map
 from ..papers import as_printed, printed_tables
 from ..pareto.command import LATENCY, SIZE, SPEED, pareto_front
 from ..runs import FrameSelection, RunSet
-from ..statistics.command import CompareSettings, compare_methods
+from ..statistics.command import compare_methods
 from ..table_report import layouts, table_of
 from ..tables import AVATAR_TITLE, COMPARISON, TITLES, Table, compact
 from ..writers import render_page
@@ -42,9 +42,9 @@ from .sections import (
     check_folder,
     failed_cells,
     loss_curves,
+    picture_files,
     record_of,
     remove_others,
-    split,
     verdict,
     write_pictures,
 )
@@ -64,23 +64,20 @@ class PageSettings(RunOptions):
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of finished runs on the same frames, as for `headbench table`."""
-
     out: str | None = None
     """File to write, with --split a folder that is new or holds an earlier report. By default report.html or report."""
-
     split: bool = False
     """Write images to separate files, in a folder with the page."""
-
     max_mb: float | None = None
     """Maximum size in megabytes (10^6 bytes). By default 10, with --split 500."""
-
     papers: Annotated[tuple[str, ...], tyro.conf.arg(name="as")] = ()
     """Papers (`headbench list papers`) in whose table layout the runs are also shown, with the rows of the paper."""
 
     def __post_init__(self) -> None:
         if not self.runs:
             raise ValueError("runs: at least one folder")
-        if self.max_mb is not None and not 0.1 <= self.max_mb <= (most := 4000 if self.split else 1000):
+        most = 4000 if self.split else 1000
+        if self.max_mb is not None and not 0.1 <= self.max_mb <= most:
             raise ValueError(f"max-mb is {self.max_mb}; from 0.1 to {most}")
 
 
@@ -90,8 +87,7 @@ OPENING_SHARE = 0.97
 """Share of the bytes for images that excludes the second copy of the opening images."""
 
 
-@dataclass(frozen=True)
-class TitledTable:
+class TitledTable(NamedTuple):
     """A table with a heading."""
 
     title: str
@@ -100,9 +96,9 @@ class TitledTable:
 
 def write_page(run: FinishedRun) -> list[Path]:
     """Write ``report.html`` of a run that has just ended; return the file."""
-    out = run.folder.page
-    _write(RunSet.read([run]), PageSettings((str(run.folder.root),), str(out)), out, MAX_MB, no_progress)
-    return [out]
+    page, _, _ = page_text(RunSet.read([run]), MAX_MB)
+    write_text(run.folder.page, page)
+    return [run.folder.page]
 
 
 @command("report", group="inspect")
@@ -117,13 +113,9 @@ def write_report(settings: PageSettings, progress: Progress = no_progress) -> Co
     else:
         check_writable(out, "--out")
     runs = RunSet.read([Path(folder) for folder in settings.runs])
-    return _write(runs, settings, out, max_mb, progress)
-
-
-def _write(
-    runs: RunSet, settings: PageSettings, out: Path, max_mb: float, progress: Progress
-) -> CommandResult:
-    page, pictures, files = page_text(runs, max_mb, settings, progress, apart=settings.split)
+    page, pictures, files = page_text(
+        runs, max_mb, settings.papers, options=settings, split=settings.split, progress=progress
+    )
     if settings.split:
         write_pictures(out, files)
         write_text(out / INDEX, page)
@@ -145,16 +137,14 @@ def _size(page: str, files: Sequence[PictureFile]) -> int:
 def page_text(
     runs: RunSet,
     max_mb: float,
-    settings: PageSettings,
-    progress: Progress = no_progress,
+    papers: Sequence[str] = (),
     *,
-    apart: bool = False,
+    options: RunOptions | None = None,
+    split: bool = False,
+    progress: Progress = no_progress,
 ) -> tuple[str, Pictures, list[PictureFile]]:
-    """The page of loaded runs, its images, and the files of images that are not embedded.
-
-    Raises `InputError` if ``max_mb`` does not suffice.
-    """
-    printed = [shown for name in settings.papers for shown in _printed(runs, name)]
+    """The page of loaded runs, its images, and with ``split`` their files; ``options`` are those to open captures."""
+    printed = [table for name in papers for table in _printed(runs, name)]
     metrics = [spec for spec in runs.metrics if spec.per_frame and COMPARISON in spec.tables]
     values = frame_values(runs, metrics)
     worst = worst_frames(values, runs, metrics[0]) if metrics else []
@@ -167,11 +157,9 @@ def page_text(
         "verdict": words,
         "tables": parts,
         "layouts": [
-            TitledTable(TITLES.get(name, name), table_of(runs, name))
-            for name in layouts(runs)
-            if name != COMPARISON
-        ]
-        + printed,
+            *(TitledTable(TITLES.get(name, name), table_of(runs, name)) for name in layouts(runs)[1:]),
+            *printed,
+        ],
         "comparisons": comparisons,
         "cards": cards,
         "anchors": {card["label"]: card["anchor"] for card in cards},
@@ -187,43 +175,43 @@ def page_text(
     empty = Pictures(truth="-" * 400)
     limit = int(max_mb * MEGABYTE)
     room = limit - len(_filled(content, data, [], empty, []).encode()) - 1000
-    room -= (
-        ENTRY_BYTES * (1 + 2 * limit // FILE_BYTES) if apart else 0
-    )  # two files together have more than that
+    # Two files together have more than `FILE_BYTES`.
+    room -= ENTRY_BYTES * (1 + 2 * limit // FILE_BYTES) if split else 0
     entry = 8 * (len(runs.methods) + 2)  # bytes of a frame's entry in the list, without its images
     room -= entry * len(data["frames"])
     # The opening images are in the page twice, so that they are visible before the script has run.
-    pictures = choose_pictures(runs, worst, int(room * OPENING_SHARE), settings, progress)
+    pictures = choose_pictures(runs, worst, int(room * OPENING_SHARE), options or RunOptions(), progress)
     best = [row.method for row in compact(parts[0].table).rows if not row.trivial]
     first = opening(runs, best, metrics, values, pictures)
-    data["opening"] = _opening(runs, first)
+    data["opening"]["frame"] = None if first.frame is None else _frames(runs).index(first.frame)
+    data["opening"]["methods"] = [runs.methods.index(label) for label in first.methods]
     content["ratio"] = _ratio(runs, first)
     images: list[str] = []
     entries = dict(zip(_frames(runs), data["frames"]))
     for frame in sorted(pictures.shown, key=lambda f: (f.group, f.key.timestep)):  # in viewing order
         entries[frame]["p"] = _places(frame, pictures, images, data["reasons"])
         entries[frame]["l"] = int(frame in pictures.lossless)
-    files = split(images) if apart else []
+    files = picture_files(images) if split else []
     data["files"] = [[file.name, file.count] for file in files]
     tiles = _tiles(runs, first, metrics, values, pictures)
-    page = _filled(content, data, [] if apart else images, pictures, tiles, apart=apart)
+    page = _filled(content, data, [] if split else images, pictures, tiles, split=split)
     if (size := _size(page, files)) > limit:
-        found = f"{size / MEGABYTE:.2f} needed"
-        raise InputError("command line", "--max-mb", "room for tables and record", found)
+        needed = f"{size / MEGABYTE:.2f} needed"
+        raise InputError("command line", "--max-mb", "room for tables and record", needed)
     return page, pictures, files
 
 
 def _printed(runs: RunSet, name: str) -> list[TitledTable]:
     """The runs in the form of a paper's tables with the same tasks. Raises `InputError` if there is none."""
-    found, refused = [], None
+    tables, refused = [], None
     for table in printed_tables(name, None):
         try:
-            found.append(TitledTable(f"As {table.table} of {name}", as_printed(runs, name, table)))
+            tables.append(TitledTable(f"As {table.table} of {name}", as_printed(runs, name, table)))
         except InputError as error:  # the runs lack the task of the table
             refused = error
-    if refused is not None and not found:
+    if refused is not None and not tables:
         raise refused
-    return found
+    return tables
 
 
 def _places(frame: ShownFrame, pictures: Pictures, images: list[str], reasons: list[str]) -> list[int]:
@@ -244,12 +232,6 @@ def _marks(runs: RunSet) -> dict[str, int]:
     """Number of each method's mark: trivial baselines after the others."""
     order = sorted(runs.methods, key=lambda label: label in runs.trivial)
     return {label: index for index, label in enumerate(order)}
-
-
-def _opening(runs: RunSet, first: Opening) -> dict[str, Any]:
-    """The opening for the script, by index."""
-    frame = None if first.frame is None else _frames(runs).index(first.frame)
-    return {"frame": frame, "methods": [runs.methods.index(label) for label in first.methods]}
 
 
 def _ratio(runs: RunSet, first: Opening) -> str:
@@ -279,16 +261,10 @@ def _tiles(
         place = runs.methods.index(label) + 1 if label else 0
         value = values.get((metrics[0].name, label, first.frame)) if metrics and label else None
         image = pictures.shown[first.frame][place]
-        tiles.append(
-            {
-                "label": label or "Ground truth",
-                "mark": _marks(runs).get(label),
-                "value": "" if value is None else f"{value:.{metrics[0].digits}f}",
-                "unit": metrics[0].unit if metrics else "",
-                "image": image,
-                "reason": pictures.reasons[first.frame][place],
-            }
-        )
+        tile = {"label": label or "Ground truth", "mark": _marks(runs).get(label)}
+        tile["value"] = "" if value is None else f"{value:.{metrics[0].digits}f}"
+        tile["unit"] = metrics[0].unit if metrics else ""
+        tiles.append({**tile, "image": image, "reason": pictures.reasons[first.frame][place]})
     return tiles
 
 
@@ -299,22 +275,16 @@ def _filled(
     pictures: Pictures,
     tiles: Sequence[dict[str, Any]],
     *,
-    apart: bool = False,
+    split: bool = False,
 ) -> str:
     size = f":root {{ --tiles: {max(1, len(tiles))}; --ratio: {content['ratio']}; }}\n"
     style = stylesheet() + content["own_style"] + size
     # A page opened from a file has no origin, so 'self' matches nothing.
-    beside = " 'self' file:" if apart else ""
+    beside = " 'self' file:" if split else ""
     hashes = " ".join(f"'{policy_hash(script)}'" for script in content["scripts"])
-    policy = "; ".join(
-        [
-            "default-src 'none'",
-            "img-src data:",
-            f"script-src {hashes}{beside}",
-            f"style-src '{policy_hash(style)}'",
-            "base-uri 'none'",
-            "form-action 'none'",
-        ]
+    policy = (
+        f"default-src 'none'; img-src data:; script-src {hashes}{beside}; style-src '{policy_hash(style)}'; "
+        "base-uri 'none'; form-action 'none'"
     )
     words = {
         "shown": len(pictures.shown),
@@ -329,9 +299,8 @@ def _filled(
 
 def _json(value: Any) -> str:
     """JSON for a script element, without "<"."""
-    return json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":")).replace(
-        "<", r"\u003c"
-    )
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", r"\u003c")
 
 
 def _frames(runs: RunSet) -> list[ShownFrame]:
@@ -346,7 +315,6 @@ def _data(
     subjects, sequences, cameras = (
         sorted({getattr(frame.key, part) for frame in frames}) for part in ("subject", "sequence", "camera")
     )
-    places = [{name: index for index, name in enumerate(names)} for names in (subjects, sequences, cameras)]
 
     def number(spec: MetricSpec, label: str, frame: ShownFrame) -> float | None:
         value = values.get((spec.name, label, frame))
@@ -368,15 +336,13 @@ def _data(
         "frames": [
             {
                 "at": [
-                    runs.tasks.index(frame.task),
-                    places[0][frame.key.subject],
-                    places[1][frame.key.sequence],
-                    places[2][frame.key.camera],
-                    frame.key.timestep,
+                    runs.tasks.index(task),
+                    *(subjects.index(key.subject), sequences.index(key.sequence), cameras.index(key.camera)),
+                    key.timestep,
                 ],
-                "v": [[number(spec, label, frame) for label in runs.methods] for spec in metrics],
+                "v": [[number(m, label, ShownFrame(task, key)) for label in runs.methods] for m in metrics],
             }
-            for frame in frames
+            for task, key in frames
         ],
         "reasons": [],
         "colours": colour_map(np.linspace(0, 1, 256)[None])[0].tolist(),
@@ -387,19 +353,12 @@ def _data(
 
 def _parts(runs: RunSet) -> list[TitledTable]:
     """The comparison of all frames, of each region and of each held-out sequence."""
-    found = [TitledTable("All frames", table_of(runs))]
-    found += [
-        TitledTable(f"Region: {region}", table_of(runs.of(FrameSelection(region=region))))
-        for region in sorted(runs.rows.regions - {FULL})
-    ]
-    sequences = sorted({key.sequence for key in runs.keys.get("self_reenactment", ())})
+    parts = {"All frames": FrameSelection()}
+    parts |= {f"Region: {name}": FrameSelection(name) for name in sorted(runs.rows.regions - {FULL})}
     if len({key.sequence for keys in runs.keys.values() for key in keys}) > 1:
-        measured = [name for name in sequences if name in runs.rows.sequences]
-        found += [
-            TitledTable(f"Sequence: {name}", table_of(runs.of(FrameSelection(sequences=(name,)))))
-            for name in measured
-        ]
-    return found
+        held_out = {key.sequence for key in runs.keys.get("self_reenactment", ())} & {*runs.rows.sequences}
+        parts |= {f"Sequence: {name}": FrameSelection(sequences=(name,)) for name in sorted(held_out)}
+    return [TitledTable(title, table_of(runs.of(part))) for title, part in parts.items()]
 
 
 def _plots(runs: RunSet, metrics: Sequence[MetricSpec]) -> list[dict[str, Any]]:
@@ -417,16 +376,12 @@ def _plots(runs: RunSet, metrics: Sequence[MetricSpec]) -> list[dict[str, Any]]:
             if len(points) < 2:
                 continue
             sign = 1 if metrics[0].higher_is_better else -1
-            plots.append(
-                {
-                    "task": TASK_TITLES.get(task, task),
-                    "title": f"{TASK_TITLES.get(task, task)}: {metrics[0].label} against {words.split(' (')[0].lower()}",
-                    "x": words,
-                    "y": f"{metrics[0].label} ({metrics[0].unit})" if metrics[0].unit else metrics[0].label,
-                    "points": [list(p) for p in points],
-                    "front": pareto_front([p[1] for p in points], [sign * p[2] for p in points]),
-                }
-            )
+            front = pareto_front([x for _, x, _ in points], [sign * quality for _, _, quality in points])
+            title, label = TASK_TITLES.get(task, task), metrics[0].label
+            against = f"{title}: {label} against {words.split(' (')[0].lower()}"
+            y = f"{label} ({metrics[0].unit})" if metrics[0].unit else label
+            plot = {"task": title, "title": against, "x": words, "y": y, "points": points, "front": front}
+            plots.append(plot)
     return plots
 
 
@@ -445,16 +400,12 @@ FOREST = 120
 def _comparisons(runs: RunSet) -> dict[str, Any]:
     """Paired differences by task and metric, or the reason why they are missing; ``all`` are plain comparisons."""
     if len(runs.ranked) < 2:
-        return {
-            "reason": "A comparison takes two methods that are no trivial baselines.",
-            "groups": [],
-            "all": [],
-        }
+        reason = "A comparison takes two methods that are no trivial baselines."
+        return {"reason": reason, "groups": [], "all": []}
     specs = {spec.name: spec for spec in runs.metrics}
-    settings = CompareSettings(tuple(str(run.folder.root) for run in runs.runs))
-    findings = compare_methods(runs, settings)
+    data = compare_methods(runs).data
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for one in findings.data["comparisons"]:
+    for one in data["comparisons"]:
         spec = specs[one["metric"]]
         task = TASK_TITLES.get(one["task"], one["task"]) or AVATAR_TITLE
         unit = f" ({spec.unit})" if spec.unit else ""
@@ -472,16 +423,16 @@ def _comparisons(runs: RunSet) -> dict[str, Any]:
     subjects = len(runs.rows.subjects)
     return {
         "reason": "",
-        "all": findings.data["comparisons"],
+        "all": data["comparisons"],
         "subjects": subjects,
-        "level": findings.data["level"],
+        "level": data["level"],
         "testable": any(
             one["p_holm"] is not None and not one["verdict"].startswith("not testable")
-            for one in findings.data["comparisons"]
+            for one in data["comparisons"]
         ),
         "groups": [
-            {"title": f"{task}, {what}", "lines": _with_forest(own) if subjects > 1 else own}
-            for (task, what), own in groups.items()
+            {"title": f"{task}, {what}", "lines": _with_forest(lines) if subjects > 1 else lines}
+            for (task, what), lines in groups.items()
         ],
     }
 
@@ -501,12 +452,7 @@ def _with_forest(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
     for line in lines:
         one = line["one"]
-        line["forest"] = {
-            "subjects": [
-                (subject, place(value), f"{value:+.4g}") for subject, value in one["differences"].items()
-            ],
-            "mean": place(one["difference"]),
-            "low": place(one["low"]),
-            "high": place(one["high"]),
-        }
+        of_subjects = [(name, place(value), f"{value:+.4g}") for name, value in one["differences"].items()]
+        ends = {"low": place(one["low"]), "high": place(one["high"])}
+        line["forest"] = {"subjects": of_subjects, "mean": place(one["difference"]), **ends}
     return lines

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -45,36 +46,27 @@ class Conclusions:
 def verdict(
     runs: RunSet, metrics: Sequence[MetricSpec], comparisons: Sequence[Mapping[str, Any]]
 ) -> Conclusions:
-    """Describe the results of the ranked methods.
-
-    Parameters
-    ----------
-    metrics : Sequence[MetricSpec]
-        Metrics of frames; sentences are on the first.
-    comparisons : Sequence[Mapping[str, Any]]
-        Those of `compare_methods`.
-    """
-    found = Conclusions(_title(runs), facts=_facts(runs))
+    """Describe the results of the ranked methods by the first of the ``metrics`` of frames and `compare_methods`."""
+    head = Conclusions(_title(runs), facts=_facts(runs))
     methods = runs.ranked
-    tasks = runs.by_camera.tasks
-    if below := not_better(runs.by_camera.rows, metrics, methods, runs.trivial, tasks):
-        found.sentences += [Markup("<b>{}</b>").format(" ".join(below.values())), Markup.escape(BELOW_CAUSES)]
-    found.sentences += [Markup("<b>{}</b>").format(text) for text in mechanisms(runs.rows, methods)[1]]
+    if below := not_better(runs.by_camera.rows, metrics, methods, runs.trivial, runs.by_camera.tasks):
+        head.sentences += [Markup("<b>{}</b>").format(" ".join(below.values())), Markup.escape(BELOW_CAUSES)]
+    head.sentences += [Markup("<b>{}</b>").format(text) for text in mechanisms(runs.rows, methods)[1]]
     methods = tuple(name for name in methods if name not in below)
     for task in runs.by_camera.tasks if metrics else ():
         if scores := _scores(runs.by_camera, methods, metrics[0], task):
-            found.sentences.append(_sentence(scores, metrics[0], task, comparisons))
-    found.sentences += _costs(runs, methods)
+            head.sentences.append(_sentence(scores, metrics[0], task, comparisons))
+    head.sentences += _costs(runs, methods)
     if len(methods) > 1:
         pairs, subjects = len(methods) * (len(methods) - 1) // 2, len(runs.rows.subjects)
         needed = subjects_needed(LEVEL, pairs)
-        found.limit = (
+        head.limit = (
             f"{counted(subjects, 'subject')} cannot show which method is better: a test of {counted(pairs, 'pair')} needs {needed}."
             if subjects < needed
             else f"Exact sign-flip test over {subjects} subjects, Holm’s correction, level {LEVEL:.0%}. It applies to subjects of "
             "captures like these, not to other captures, resolutions or training budgets. “Not significant” does not mean equal."
         )
-    return found
+    return head
 
 
 def _title(runs: RunSet) -> str:
@@ -90,8 +82,8 @@ def _title(runs: RunSet) -> str:
 def _scores(runs: RunSet, names: Sequence[str], spec: MetricSpec, task: str) -> list[tuple[str, float]]:
     """Methods with their means, best first."""
     means = [(name, summarise(runs.rows, name, spec.name, task).value) for name in names]
-    known = [(name, value) for name, value in means if value is not None]
-    return sorted(known, key=lambda pair: -pair[1] if spec.higher_is_better else pair[1])
+    measured = [(name, value) for name, value in means if value is not None]
+    return sorted(measured, key=lambda pair: -pair[1] if spec.higher_is_better else pair[1])
 
 
 def _task(task: str) -> str:
@@ -103,10 +95,7 @@ def _amount(value: float, spec: MetricSpec) -> str:
 
 
 def _sentence(
-    scores: Sequence[tuple[str, float]],
-    spec: MetricSpec,
-    task: str,
-    comparisons: Sequence[Mapping[str, Any]],
+    scores: Sequence[tuple[str, float]], spec: MetricSpec, task: str, comparisons: Sequence[Mapping[str, Any]]
 ) -> Markup:
     """The best method of a task and its lead over the next, with interval and outcome of the test where there is one."""
     leader, best = scores[0]
@@ -130,14 +119,14 @@ def _sentence(
 
 def _costs(runs: RunSet, names: Sequence[str]) -> list[Markup]:
     """The smallest and the fastest method, each with the next one."""
-    known, found = {spec.name: spec for spec in runs.metrics}, []
+    specs, sentences = {spec.name: spec for spec in runs.metrics}, []
     for metric, what in ((SIZE, "smallest"), (SPEED, "fastest")):
-        scores = _scores(runs, names, known[metric], "") if metric in known else []
+        scores = _scores(runs, names, specs[metric], "") if metric in specs else []
         if len(scores) > 1:
             (first, value), (second, other) = scores[:2]
-            amounts = _amount(value, known[metric]), second, _amount(other, known[metric])
-            found.append(Markup("<b>{}</b> is the {}, {} ({} {}).").format(first, what, *amounts))
-    return found
+            amounts = _amount(value, specs[metric]), second, _amount(other, specs[metric])
+            sentences.append(Markup("<b>{}</b> is the {}, {} ({} {}).").format(first, what, *amounts))
+    return sentences
 
 
 def _facts(runs: RunSet) -> list[tuple[str, str]]:
@@ -183,22 +172,19 @@ class PictureFile:
     count: int
 
 
-def split(images: Sequence[str]) -> list[PictureFile]:
+def picture_files(images: Sequence[str]) -> list[PictureFile]:
     """Distribute base64 images over files of at most `FILE_BYTES`, or with a single image."""
     groups: list[list[str]] = []
-    used = 0
     for image in images:
-        if not groups or used + len(image) > FILE_BYTES:
+        if not groups or sum(map(len, groups[-1])) + len(image) > FILE_BYTES:
             groups.append([])
-            used = 0
         groups[-1].append(image)
-        used += len(image)
-    return [_file(index, group) for index, group in enumerate(groups)]
-
-
-def _file(index: int, images: list[str]) -> PictureFile:
-    text = f"addPictures({index}, {json.dumps(images, separators=(',', ':'))});\n"
-    return PictureFile(f"{FOLDER}/{hashlib.sha256(text.encode()).hexdigest()[:20]}.js", text, len(images))
+    files = []
+    for index, group in enumerate(groups):
+        text = f"addPictures({index}, {json.dumps(group, separators=(',', ':'))});\n"
+        name = f"{FOLDER}/{hashlib.sha256(text.encode()).hexdigest()[:20]}.js"
+        files.append(PictureFile(name, text, len(group)))
+    return files
 
 
 def check_folder(folder: Path) -> None:
@@ -227,10 +213,6 @@ def remove_others(folder: Path, files: Sequence[PictureFile]) -> None:
             path.unlink()
 
 
-def name_of(run: RunData) -> str:
-    return run.folder.root.resolve().name
-
-
 def record_of(run: RunData) -> dict[str, Any]:
     """Provenance of a run's results, as text; without local paths."""
     manifest = run.manifest
@@ -239,13 +221,11 @@ def record_of(run: RunData) -> dict[str, Any]:
     }
     machine = manifest.machine
     return {
-        "name": name_of(run),
+        "name": run.folder.root.resolve().name,
         "done": manifest.status == "done",
         "facts": [
             ("Machine", run.machine),
-            ("Cores", str(machine.get("cores", ""))),
-            ("System", str(machine.get("system", ""))),
-            ("Python", str(machine.get("python", ""))),
+            *((name.capitalize(), str(machine.get(name, ""))) for name in ("cores", "system", "python")),
             *((str(name), str(version)) for name, version in dict(machine.get("packages") or {}).items()),
             ("Seconds of the last start", "" if manifest.seconds is None else f"{manifest.seconds:.0f}"),
         ],
@@ -265,9 +245,7 @@ def record_of(run: RunData) -> dict[str, Any]:
 
 def _excluded(frames: dict[tuple[Any, ...], None]) -> list[tuple[str, str, str, str, str]]:
     """Subject, sequence, timestep, number of cameras, reason."""
-    moments: dict[tuple[Any, ...], int] = {}
-    for subject, sequence, timestep, _, why in frames:
-        moments[subject, sequence, timestep, why] = moments.get((subject, sequence, timestep, why), 0) + 1
+    moments = Counter((subject, sequence, timestep, why) for subject, sequence, timestep, _, why in frames)
     return [(subject, seq, str(t), str(n), why) for (subject, seq, t, why), n in sorted(moments.items())]
 
 
@@ -282,16 +260,13 @@ def _without_folders(value: Any) -> Any:
 
 def failed_cells(runs: RunSet) -> list[tuple[str, str, str, str]]:
     """Method, seed, subject and error of each avatar that failed."""
-    found: dict[tuple[str, str, str, str], None] = {}
+    cells = []
     for label in runs.rows.failed:
-        own = runs.rows.select(method=label, metric=ALL, task=ALL, region=ALL, seeds=ALL)
-        own = own[own["status"] == "failed"].drop_duplicates(["seed", "subject", "reason"])
-        for seed, subject, reason in own[["seed", "subject", "reason"]].itertuples(index=False, name=None):
-            found[label, str(seed), str(subject), str(reason)] = None
-    return [*found]
-
-
-Curve = list[tuple[int, float]]
+        rows = runs.rows.select(method=label, metric=ALL, task=ALL, region=ALL, seeds=ALL)
+        errors = rows[rows["status"] == "failed"][["seed", "subject", "reason"]].drop_duplicates()
+        for seed, subject, reason in errors.itertuples(index=False, name=None):
+            cells.append((label, str(seed), str(subject), str(reason)))
+    return cells
 
 
 def loss_curves(runs: RunSet) -> list[dict[str, Any]]:
@@ -300,29 +275,21 @@ def loss_curves(runs: RunSet) -> list[dict[str, Any]]:
     Losses are divided by the first recorded one, and averaged over the subjects that recorded the same iterations as the
     first; seeds are those of the pictures. Damaged records are ignored.
     """
-    found = []
+    by_method = []
     for index, label in enumerate(runs.methods):
         run, name = runs.pictured[label]
-        curves = []
+        curves: list[dict[int, float]] = []
         for clip in run.manifest.clips:
-            try:
+            losses: list[tuple[int, float]] = []
+            with suppress(InputError, OSError):
                 losses = training_losses(run.folder.cell(clip.subject, name, run.seed).avatar)
-            except (InputError, OSError):
-                losses = []
             if len(losses) > 1 and all(value > 0 for _, value in losses):
-                curves.append([(at, value / losses[0][1]) for at, value in losses])
+                curves.append({at: value / losses[0][1] for at, value in losses})
         if curves:
-            found.append({"method": index, "points": _mean(curves)})
-    return found
-
-
-def _mean(curves: list[Curve]) -> Curve:
-    iterations = [at for at, _ in curves[0]]
-    alike = [curve for curve in curves if [at for at, _ in curve] == iterations]
-    return [
-        (at, float(f"{sum(curve[i][1] for curve in alike) / len(alike):.4g}"))
-        for i, at in enumerate(iterations)
-    ]
+            alike = [curve for curve in curves if [*curve] == [*curves[0]]]
+            means = ((at, sum(curve[at] for curve in alike) / len(alike)) for at in curves[0])
+            by_method.append({"method": index, "points": [(at, float(f"{mean:.4g}")) for at, mean in means]})
+    return by_method
 
 
 def cards_of(runs: RunSet) -> list[dict[str, Any]]:
@@ -333,23 +300,13 @@ def cards_of(runs: RunSet) -> list[dict[str, Any]]:
     """
     cards = []
     for index, (label, record) in enumerate(runs.records.items()):
-        known: MethodSpec | None = None
+        registered: MethodSpec | None = None
         with suppress(HeadbenchError):  # no installed method
             spec: MethodSpec = get("methods", record.name)
-            known = spec if spec.implementation == record.implementation else None
-        budget = {name: value for name, value in record.budget.items() if value is not None}
-        cards.append(
-            {
-                "anchor": f"method-{index + 1}",
-                "label": label,
-                "name": record.name,
-                "trivial": record.trivial,
-                "summary": known.summary if known else "",
-                "source": known.source if known else "",
-                "bibtex": known.bibtex.strip() if known else "",
-                "version": record.version,
-                "implementation": record.implementation,
-                "budget": "" if record.trivial else ", ".join(f"{n:,} {name}" for name, n in budget.items()),
-            }
-        )
+            registered = spec if spec.implementation == record.implementation else None
+        budget = ", ".join(f"{n:,} {name}" for name, n in record.budget.items() if n is not None)
+        recorded = {name: getattr(record, name) for name in ("name", "trivial", "version", "implementation")}
+        texts = {name: getattr(registered, name, "").strip() for name in ("summary", "source", "bibtex")}
+        card = {"anchor": f"method-{index + 1}", "label": label, **recorded, **texts}
+        cards.append({**card, "budget": "" if record.trivial else budget})
     return sorted(cards, key=lambda card: card["trivial"])

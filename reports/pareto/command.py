@@ -5,9 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 import tyro
@@ -56,20 +58,17 @@ SIZE, SPEED, LATENCY = "storage", "fps", "latency_p50"
 
 @dataclass(frozen=True)
 class ParetoPoint:
-    """One method of one run, means over frames, subjects and seeds.
-
-    ``megabytes`` and ``milliseconds`` are None where the run did not measure them. Milliseconds are the
-    median frame time, or the inverse of the mean rate if a run has no median. ``derived_from`` and
-    ``variant`` are "" for a trained avatar.
-    """
+    """One method of one run, means over frames, subjects and seeds."""
 
     run: str
     method: str
-    derived_from: str
+    derived_from: str  # "" for a trained avatar, likewise the variant
     variant: str
     quality: float
-    megabytes: float | None
-    milliseconds: float | None
+    megabytes: float | None  # None: not measured
+    milliseconds: (
+        float | None
+    )  # median frame time, or the inverse of the mean rate; None: neither was measured
     machine: str
 
     @property
@@ -82,11 +81,11 @@ def front_of(
     points: Sequence[ParetoPoint], cost: str, *, higher_is_better: bool, series: str | None = None
 ) -> list[int]:
     """Indices of the front of all points, or of one series, whose cost (a field of `ParetoPoint`) was measured."""
-    among = [i for i, point in enumerate(points) if series in (None, point.series)]
-    known = [i for i in among if getattr(points[i], cost) is not None]
+    costs = {i: getattr(point, cost) for i, point in enumerate(points) if series in (None, point.series)}
+    measured = [i for i, value in costs.items() if value is not None]
     sign = 1.0 if higher_is_better else -1.0
-    front = pareto_front([getattr(points[i], cost) for i in known], [sign * points[i].quality for i in known])
-    return [known[i] for i in front]
+    front = pareto_front([costs[i] for i in measured], [sign * points[i].quality for i in measured])
+    return [measured[i] for i in front]
 
 
 def read_points(
@@ -96,8 +95,7 @@ def read_points(
     the metric, and a note on frame times that are not comparable ("": all are).
 
     ``metric`` "" is the first of frames that the runs have; ``time`` names the metric of milliseconds; "" the
-    median latency, or the inverse of the frames per second. Raises `InputError` if runs were scored on
-    different frames or protocols, if one lacks the task or the metric, and if no point remains.
+    median latency, or the inverse of the frames per second.
     """
     points: list[ParetoPoint] = []
     left_out: list[str] = []
@@ -108,17 +106,16 @@ def read_points(
         data.rows.check()
         if task not in data.tasks:
             raise InputError(folder, "task", ", ".join(data.tasks), task)
-        found = next((m for m in data.metrics if m.per_frame and metric in ("", m.name)), None)
-        if found is None:
-            names = ", ".join(m.name for m in data.metrics if m.per_frame)
-            raise InputError(folder, "metric", f"a metric of frames: {names}", metric)
-        metric = found.name
-        spec = spec or found
-        times = [m.name for m in data.metrics if m.unit == "ms"]
+        of_frames = {m.name: m for m in data.manifest.metrics if m.per_frame}
+        metric = metric or next(iter(of_frames), "")
+        if metric not in of_frames:
+            raise InputError(folder, "metric", f"a metric of frames: {', '.join(of_frames)}", metric)
+        spec = spec or of_frames[metric]
+        times = [m.name for m in data.manifest.metrics if m.unit == "ms"]
         if time and time not in times:
             raise InputError(folder, "time", f"a metric in ms: {', '.join(times) or 'none'}", time)
         check_same_protocol(runs[0], data, task)
-        measured = conditions(data.rows, data.metrics, data.methods)
+        measured = conditions(data.rows, data.manifest.metrics, data.methods)
         derived = {c.name for c in data.manifest.configuration.conditions if c.derive}
         for record in data.manifest.methods:
             if record.trivial:
@@ -142,8 +139,8 @@ def read_points(
                 ParetoPoint(str(folder), label, source, variant, quality.value, *costs, data.machine)
             )
     if spec is None or not points:
-        found_instead = "; ".join(left_out) or "none"
-        raise InputError("runs", "", "a method, no trivial baseline, with a value", found_instead)
+        expected = "a method, no trivial baseline, with a value"
+        raise InputError("runs", "", expected, "; ".join(left_out) or "none")
     return points, left_out, spec, note_of(timings)
 
 
@@ -166,20 +163,16 @@ class RatePoint:
 
 @dataclass(frozen=True)
 class RateDifference:
-    """Bjontegaard difference of a method to a reference, percent; negative: fewer bytes at equal quality.
-
-    ``low`` and ``high`` are the 95 % interval over subjects, by Student's t of the logarithm, None with fewer than
-    `LEAST_SUBJECTS`; ``reason`` says why there is no ``percent``.
-    """
+    """Bjontegaard difference of a method to a reference, percent; negative: fewer bytes at equal quality."""
 
     method: str
     reference: str
     metric: str
     percent: float | None
-    low: float | None = None
+    low: float | None = None  # of the 95 % interval over subjects, by Student's t of the logarithm
     high: float | None = None
     subjects: int = 0
-    reason: str = ""
+    reason: str = ""  # why there is no ``percent``
 
 
 def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], list[MetricSpec]]:
@@ -189,8 +182,8 @@ def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], lis
     training, named as in a `RunSet`. Raises `InputError` for two runs with different values of the same training. Runs of
     different subjects are joined before (`runs.joined_subjects`).
     """
-    found: list[tuple[int, RatePoint]] = []
-    metrics = [m for m in runs[0].metrics if m.name in METRICS and m.per_frame] if runs else []
+    measured: list[tuple[int, RatePoint]] = []
+    metrics = [m for m in runs[0].manifest.metrics if m.name in METRICS and m.per_frame] if runs else []
     for index, run in enumerate(runs):
         derived = {c.name for c in run.manifest.configuration.conditions if c.derive}
         steps = {name for name in derived if name == CODED or name.startswith(f"{CODED}-x")}
@@ -199,19 +192,18 @@ def read_rates(runs: Sequence[RunData], task: str) -> tuple[list[RatePoint], lis
                 continue
             sizes = _by_subject(run, record.label, SIZE, "")
             quality = {metric.name: _by_subject(run, record.label, metric.name, task) for metric in metrics}
-            found.append((index, RatePoint(record.name, record.condition, sizes, quality)))
-    first = {(point.method, point.variant): point for _, point in reversed(found)}
-    differing = {point.method for _, point in found if point != first[point.method, point.variant]}
+            measured.append((index, RatePoint(record.name, record.condition, sizes, quality)))
+    first = {(point.method, point.variant): point for _, point in reversed(measured)}
+    differing = {point.method for _, point in measured if point != first[point.method, point.variant]}
     labels = training_labels(runs) if differing else []
     points: dict[tuple[str, str], RatePoint] = {}
-    for index, point in found:
+    for index, point in measured:
         if point.method in differing:
             point = replace(point, method=labels[index].get(point.method, point.method))
         if points.setdefault((point.method, point.variant), point) != point:
-            expected = f"the values of {label_of(point.method, point.variant)} in another run"
-            raise InputError(
-                runs[index].folder.root, "method", expected, "other values", "Give one of the runs."
-            )
+            folder, label = runs[index].folder.root, label_of(point.method, point.variant)
+            expected = f"the values of {label} in another run"
+            raise InputError(folder, "method", expected, "other values", "Give one of the runs.")
     coded = {point.method for point in points.values() if point.variant}
     return [point for point in points.values() if point.method in coded], metrics
 
@@ -225,9 +217,10 @@ def _by_subject(run: RunData, label: str, metric: str, task: str) -> dict[str, f
 
 def curve_of(points: Sequence[RatePoint], method: str, metric: str, subject: str) -> Curve:
     """Megabytes and quality of a method's coded avatars of one subject, by increasing size."""
-    own = [p for p in points if p.method == method and p.variant and subject in p.megabytes]
-    values = [(p.megabytes[subject], p.quality[metric][subject]) for p in own if subject in p.quality[metric]]
-    return sorted(values)
+    coded = [p for p in points if p.method == method and p.variant and subject in p.megabytes]
+    return sorted(
+        (p.megabytes[subject], p.quality[metric][subject]) for p in coded if subject in p.quality[metric]
+    )
 
 
 def rate_difference(reference: Curve, other: Curve, *, higher_is_better: bool = True) -> float | None:
@@ -265,35 +258,27 @@ def rate_differences(
     """The difference of every method to the reference in every metric: mean over subjects, with an interval."""
     methods = [name for name in dict.fromkeys(point.method for point in points) if name != reference]
     subjects = sorted({subject for point in points for subject in point.megabytes})
-    found = []
-    for metric in metrics:
-        for method in methods:
-            values = {
-                subject: rate_difference(
-                    curve_of(points, reference, metric.name, subject),
-                    curve_of(points, method, metric.name, subject),
-                    higher_is_better=metric.higher_is_better,
-                )
-                for subject in subjects
-            }
-            found.append(_difference(method, reference, metric.name, values))
-    return found
+    differences = []
+    for metric, method in product(metrics, methods):
+        values = []
+        for subject in subjects:
+            curves = (curve_of(points, name, metric.name, subject) for name in (reference, method))
+            values.append(rate_difference(*curves, higher_is_better=metric.higher_is_better))
+        differences.append(_difference(method, reference, metric.name, values))
+    return differences
 
 
-def _difference(
-    method: str, reference: str, metric: str, values: Mapping[str, float | None]
-) -> RateDifference:
-    lacking = [subject for subject, value in values.items() if value is None]
-    if lacking or not values:
+def _difference(method: str, reference: str, metric: str, values: Sequence[float | None]) -> RateDifference:
+    logarithms = [value for value in values if value is not None]
+    if len(logarithms) < len(values) or not values:
         reason = (
-            f"{len(lacking)} of {len(values)} subjects have fewer than {LEAST_POINTS} steps of increasing quality, or curves "
+            f"{len(values) - len(logarithms)} of {len(values)} subjects have fewer than {LEAST_POINTS} steps of increasing quality, or curves "
             "without a common range of quality"
         )
         return RateDifference(method, reference, metric, None, reason=reason)
-    known = [float(value) for value in values.values() if value is not None]
-    mean, half = fmean(known), half_width(known) if len(known) >= LEAST_SUBJECTS else None
+    mean, half = fmean(logarithms), half_width(logarithms) if len(logarithms) >= LEAST_SUBJECTS else None
     low, high = (None, None) if half is None else (_percent(mean - half), _percent(mean + half))
-    return RateDifference(method, reference, metric, _percent(mean), low, high, len(known))
+    return RateDifference(method, reference, metric, _percent(mean), low, high, len(logarithms))
 
 
 def _percent(logarithm: float) -> float:
@@ -307,19 +292,14 @@ class ParetoSettings:
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of finished runs: every method in each is a point, such as the settings of a sweep. Runs of different subjects
     with the same methods and settings are joined; several trainings of a subject have a curve of rates each."""
-
     out: str
     """Folder to write: points.csv and pareto.png; with coded avatars also rates.csv and rate_distortion.png."""
-
     task: str = "novel_view"
     """Task whose frames give the quality."""
-
     metric: str = ""
     """Metric of quality; default: the first of frames that the runs have."""
-
     time: str = ""
     """Metric of frame time, in ms: latency_p50 (default, or 1 / frames per second), processor_time, ..."""
-
     reference: str = ""
     """Method that BD-rates compare with, if the runs have coded avatars at several steps; default: the first."""
 
@@ -342,17 +322,16 @@ def pareto(
     runs: Sequence[str], out: Path, task: str, metric_name: str = "", time: str = "", reference: str = ""
 ) -> CommandResult:
     """Write ``points.csv`` and ``pareto.png`` of finished runs, and ``rates.csv`` and ``rate_distortion.png`` if they have
-    coded avatars at several steps. Runs of different subjects are joined. Raises `InputError` for runs that cannot be compared."""
+    coded avatars at several steps. Runs of different subjects are joined."""
     read = joined_subjects([RunData.read(Path(run)) for run in runs])
     points, left_out, metric, note = read_points(read, task, metric_name, time)
     check_output_folder(out)
     rising = metric.higher_is_better
     fronts = {cost: front_of(points, cost, higher_is_better=rising) for cost in COSTS}
-    names = [field.name for field in fields(ParetoPoint)]
-    lines: list[list[object]] = [[*names, *(f"on_front_of_{cost}" for cost in COSTS)]]
-    for index, point in enumerate(points):
-        marks = [int(index in fronts[cost]) for cost in COSTS]
-        lines.append([*(getattr(point, name) for name in names), *marks])
+    records = [asdict(point) for point in points]
+    lines: list[list[object]] = [[*records[0], *(f"on_front_of_{cost}" for cost in COSTS)]]
+    for index, record in enumerate(records):
+        lines.append([*record.values(), *(int(index in fronts[cost]) for cost in COSTS)])
     write_text(out / "points.csv", csv_text(lines))
     unit = f", {metric.unit}" if metric.unit else ""
     labels = dict(COSTS)
@@ -367,15 +346,9 @@ def pareto(
         left_out.append(f"curves of rate and distortion: {error}")
     else:
         rates = _rates(*curves, out, task, reference)
-    data = {
-        "out": out,
-        "points": [asdict(point) for point in points],
-        "fronts": fronts,
-        "left_out": left_out,
-        "note": note,
-        "rates": [asdict(rate) for rate in rates],
-    }
-    text = _text(points, fronts, left_out, metric.label, metric.digits, note)
+    data = {"out": out, "points": records, "fronts": fronts, "left_out": left_out, "note": note}
+    data["rates"] = [asdict(rate) for rate in rates]
+    text = _text(points, fronts, left_out, metric, note)
     names = ["points.csv", "pareto.png", *(("rates.csv", "rate_distortion.png") if rates else ())]
     written = ", ".join(str(out / name) for name in names)
     return CommandResult("\n".join([text, *map(_rate_text, rates), f"Written: {written}"]), data)
@@ -416,18 +389,16 @@ def _text(
     points: Sequence[ParetoPoint],
     fronts: dict[str, list[int]],
     left_out: Sequence[str],
-    label: str,
-    digits: int,
+    metric: MetricSpec,
     note: str,
 ) -> str:
     rows = []
     for index, point in enumerate(points):
-        costs = [
-            f"{'-' if value is None else f'{value:.2f}'}{' *' if index in fronts[cost] else ''}"
-            for cost, value in (("megabytes", point.megabytes), ("milliseconds", point.milliseconds))
-        ]
-        rows.append([point.method, f"{point.quality:.{digits}f}", *costs, point.run])
-    lines = [table(["method", label, "MB", "ms", "run"], rows), "* On the front of size or time."]
+        values = {cost: getattr(point, cost) for cost in COSTS}
+        costs = ["-" if value is None else f"{value:.2f}" for value in values.values()]
+        costs = [text + " *" * (index in fronts[cost]) for cost, text in zip(COSTS, costs)]
+        rows.append([point.method, f"{point.quality:.{metric.digits}f}", *costs, point.run])
+    lines = [table(["method", metric.label, "MB", "ms", "run"], rows), "* On the front of size or time."]
     if any(point.derived_from for point in points):
         lines.append("METHOD+VARIANT was derived from the trained avatar, without training.")
     lines += [f"Frame times: {note}"] if note else []
@@ -467,11 +438,10 @@ def write_plot(
         for axes, cost in plots:
             axes.set(xlabel=costs[cost])
             start_axes(axes, quality)
-            ends = [
-                front_of(points, cost, higher_is_better=higher_is_better, series=s) for s in (None, *colours)
-            ]
-            fronts[cost] = ends
-            _draw(axes, points, cost, dict(zip(colours, ends[1:])), ends[0], colours)
+            how = {"higher_is_better": higher_is_better}
+            best, *others = (front_of(points, cost, series=s, **how) for s in (None, *colours))
+            fronts[cost] = best, *others
+            _draw(axes, points, cost, dict(zip(colours, others)), best, colours)
         figure.draw_without_rendering()  # compute the layout before placing labels
         for axes, cost in plots:
             label_points(axes, points, cost, list(itertools.chain(*fronts[cost])))
@@ -507,9 +477,9 @@ def _draw_rates(
     axes: Axes, points: Sequence[RatePoint], metric: str, name: str, colour: str, marker: str
 ) -> bool:
     """Draw the curve of one method; return whether there is one."""
-    own = {point.variant: point.mean(metric) for point in points if point.method == name}
-    trained = own.pop("", None)
-    curve = sorted((*value, variant) for variant, value in own.items() if value is not None)
+    means = {point.variant: point.mean(metric) for point in points if point.method == name}
+    trained = means.pop("", None)
+    curve = sorted((*value, variant) for variant, value in means.items() if value is not None)
     if curve:
         axes.plot(*list(zip(*curve))[:2], f"{marker}-", color=colour, markersize=MARKER - 2, linewidth=1)
         for size, value, variant in curve:
@@ -543,17 +513,11 @@ def _draw(
         corners = [(getattr(points[i], cost), points[i].quality) for i in front]
         axes.step(*zip(*corners), where="post", color=colours[name], linewidth=1) if corners else None
     for index, point in enumerate(points):
-        if getattr(point, cost) is not None:
-            colour = colours[point.series]
-            axes.plot(
-                getattr(point, cost),
-                point.quality,
-                marker="o" if point.variant else "s",
-                markersize=MARKER,
-                color=colour,
-                markerfacecolor=colour if index in best else "white",
-                zorder=3,
-            )
+        if (x := getattr(point, cost)) is not None:
+            colour, shape = colours[point.series], "o" if point.variant else "s"
+            look: dict[str, Any] = {"color": colour, "markersize": MARKER, "zorder": 3}
+            fill = colour if index in best else "white"
+            axes.plot(x, point.quality, marker=shape, markerfacecolor=fill, **look)
     cost_axis(axes)
 
 
@@ -569,16 +533,8 @@ def label_points(axes: Axes, points: Sequence[ParetoPoint], cost: str, order: Se
     for index in dict.fromkeys(order):
         variant = points[index].variant
         for right, up, align in BESIDE if variant else ():
-            label = axes.annotate(
-                variant,
-                places[index],
-                (right, up),
-                textcoords="offset points",
-                ha=align,
-                fontsize=7,
-                color=GREY,
-                in_layout=False,
-            )
+            look: dict[str, Any] = {"ha": align, "fontsize": 7, "color": GREY, "in_layout": False}
+            label = axes.annotate(variant, places[index], (right, up), textcoords="offset points", **look)
             box = label.get_window_extent()
             inside = axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1
             if inside and not any(box.overlaps(other) for other in taken):

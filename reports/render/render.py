@@ -34,43 +34,30 @@ class RenderSettings:
 
     capture: str
     """Capture with the cameras and poses; of another subject, too, if its head model is that of the avatar."""
-
     out: str
     """Folder to write: FRAMES/SEQUENCE_TIMESTEP_CAMERA.png, as `headbench evaluate` reads them, or orbit/00000.png."""
-
     frames: Literal["self_reenactment", "novel_view", "train", "orbit"] = "self_reenactment"
     """Which frames of the capture, by split; or an orbit between and beyond its training cameras."""
-
     cameras: tuple[str, ...] = ()
     """Only these cameras; for an orbit, those that it passes."""
-
     timesteps: tuple[int, ...] = ()
     """Only these timesteps; for an orbit, its sequence of poses (default: the first of training)."""
-
     views: int = 60
     """Number of views of the orbit, with --frames orbit."""
-
     beyond: float = 30.0
     """With --frames orbit: angle beyond the outermost cameras, degrees."""
-
     video: bool = False
     """Also write videos, one for each sequence and camera. Needs PyAV (extra `video`)."""
-
     beside: bool = False
     """With --video of captured frames: show the captured image next to each."""
-
     fps: float = 25.0
     """With --video: frames per second."""
-
     method: str = ""
     """Method of the avatar as package.module:SPEC, where it is not registered."""
-
     reader: str = ""
     """Reader of the capture; default: the one that finds it."""
-
     head: str | None = None
     """Head model for captures without one: FLAME pickle or npz."""
-
     device: str = "cpu"
     """Rendering device."""
 
@@ -103,11 +90,7 @@ class Shot(NamedTuple):
 
 @command("render", group="inspect", writes="out")
 def render_avatar(settings: RenderSettings, progress: Progress = no_progress) -> CommandResult:
-    """Render a stored avatar: frames of a task, or an orbit; as images and video.
-
-    Raises `InputError` for an invalid avatar, a capture that the method does not support, and cameras and
-    timesteps that the capture lacks.
-    """
+    """Render a stored avatar: frames of a task, or an orbit; as images and video."""
     if settings.video:
         browser_encoder()
     stored = open_avatar(Path(settings.avatar), settings.method)
@@ -119,19 +102,17 @@ def render_avatar(settings: RenderSettings, progress: Progress = no_progress) ->
     form = AdaptedClip(clip)
     if adaptation is not None:
         form = apply(adaptation, needs, out / "adapted" / clip.subject, f"adapting {clip.subject}")
-    shots = [
-        *(_orbit(settings, form, out) if settings.frames == ORBIT else _frames(settings, clip, form, out))
-    ]
+    orbit = settings.frames == ORBIT
+    shots = [*(_orbit(settings, form, out) if orbit else _frames(settings, clip, form, out))]
     background = clip.background.tolist()
     for index, shot in enumerate(shots):
         rgb = avatar.render(shot.camera, shot.pose, background).rgb
         write_png(shot.path, quantise(shot.finish(rgb)), RENDER)
         progress(index + 1, len(shots), shot.path.name)
     videos = _videos(shots, settings) if settings.video else []
-    text = f"{out}: {counted(len(shots), 'frame')} in {shots[0].path.parent.name}/" + "".join(
-        f"\n{v}" for v in videos
-    )
-    return CommandResult(text, {"out": out, "frames": [shot.path for shot in shots], "videos": videos})
+    first = f"{out}: {counted(len(shots), 'frame')} in {shots[0].path.parent.name}/"
+    data = {"out": out, "frames": [shot.path for shot in shots], "videos": videos}
+    return CommandResult("\n".join([first, *map(str, videos)]), data)
 
 
 def _clip(settings: RenderSettings) -> Clip:
@@ -166,10 +147,8 @@ def _frames(settings: RenderSettings, clip: Clip, form: AdaptedClip, out: Path) 
         camera, pose = form.clip.cameras[seen.camera], form.clip.poses[seen.timestep]
         name = Cell(out).render(settings.frames, key).name
         video = out / f"{settings.frames}_{key.sequence}_{key.camera}.webm"
-        yield Shot(
-            *(out / settings.frames / name, video, camera, pose),
-            *(partial(form.restore, key), partial(clip.image, key)),
-        )
+        finish, captured = partial(form.restore, key), partial(clip.image, key)
+        yield Shot(out / settings.frames / name, video, camera, pose, finish, captured)
 
 
 def _orbit(settings: RenderSettings, form: AdaptedClip, out: Path) -> Iterator[Shot]:
@@ -182,18 +161,16 @@ def _orbit(settings: RenderSettings, form: AdaptedClip, out: Path) -> Iterator[S
     cameras = [clip.cameras[name] for name in settings.cameras or trained]
     views = turntable(cameras, head_center(clip), settings.views, settings.beyond)
     for number, view in enumerate(views):
-        pose = poses[number % len(poses)]
-        yield Shot(
-            out / ORBIT / f"{number:05d}.png", out / f"{ORBIT}.webm", view.camera, pose, lambda rgb: rgb
-        )
+        path, pose = out / ORBIT / f"{number:05d}.png", poses[number % len(poses)]
+        yield Shot(path, out / f"{ORBIT}.webm", view.camera, pose, lambda rgb: rgb)
 
 
 def _known(option: str, asked: Sequence[int | str], known: Iterable[int | str], of: str) -> None:
     unknown = sorted(set(asked) - set(known))
     if unknown:
         names = sorted(known)
-        shown = ", ".join(map(str, names if len(names) < 20 else [names[0], "...", names[-1]]))
-        raise InputError("command line", option, f"those of {of}: {shown}", ", ".join(map(str, unknown)))
+        offered = ", ".join(map(str, names if len(names) < 20 else [names[0], "...", names[-1]]))
+        raise InputError("command line", option, f"those of {of}: {offered}", ", ".join(map(str, unknown)))
 
 
 def _videos(shots: Sequence[Shot], settings: RenderSettings) -> list[Path]:
@@ -202,12 +179,8 @@ def _videos(shots: Sequence[Shot], settings: RenderSettings) -> list[Path]:
     for shot in shots:
         parts.setdefault(shot.video, []).append(shot)
     for video, members in parts.items():
-        kind = COMPOSITE if settings.beside else RENDER
-        write_browser_video(video, (_pictured(shot, settings.beside) for shot in members), settings.fps, kind)
+        images = (read_png(shot.path) for shot in members)
+        if settings.beside:  # the captured image on the left
+            images = (np.hstack([s.captured(), i]) if s.captured else i for s, i in zip(members, images))
+        write_browser_video(video, images, settings.fps, COMPOSITE if settings.beside else RENDER)
     return list(parts)
-
-
-def _pictured(shot: Shot, beside: bool) -> ByteArray:
-    """A frame of a video: the render, with the captured image on its left if requested."""
-    image = read_png(shot.path)
-    return np.hstack([shot.captured(), image]) if beside and shot.captured else image

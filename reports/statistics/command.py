@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import chain, combinations
 from pathlib import Path
@@ -23,7 +24,7 @@ from ..aggregate import conditions, note_of
 from ..runs import FrameSelection, RunSet
 from ..tables import AVATAR_TITLE, BELOW_CAUSES, COMPARISON, not_better
 from ..writers import csv_text
-from .comparisons import PairedComparison, compare
+from .comparisons import LEVEL, PairedComparison, compare
 
 
 @dataclass(frozen=True)
@@ -34,29 +35,21 @@ class CompareSettings(BaselineOptions):
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of finished runs on the same frames. Seeds of a method are combined; other settings count as another method."""
-
     against: Annotated[str | None, tyro.conf.arg(metavar="METHOD")] = None
     """Compare every method with this one only, instead of all pairs: with fewer comparisons, fewer subjects are needed."""
-
     metrics: tuple[str, ...] = ()
     """Metrics to compare; default: those of the comparison table."""
-
     trivial: bool = False
     """Also compare the trivial baselines (mean image, nearest camera)."""
-
     region: str = "full"
     """Region of the frames to compare on, such as face."""
-
     sequences: tuple[str, ...] = ()
     """Only frames of these sequences; default: all."""
-
     level: float = 0.05
     """Level of the tests; intervals have a confidence of one minus it."""
-
     equivalence: tuple[str, ...] = ()
     """Also test whether methods are equivalent: METRIC=MARGIN in the metric's unit, such as `psnr=0.3`, for each metric to
     test."""
-
     format: Literal["text", "csv"] = "text"
     """Format of the output; csv adds uncorrected p-values and subjects won, --json also the difference of each subject."""
 
@@ -64,18 +57,11 @@ class CompareSettings(BaselineOptions):
         *DEPENDENT,
         DependentOptions(
             (
-                "against",
-                "metrics",
-                "trivial",
-                "region",
-                "sequences",
-                "level",
-                "equivalence",
+                *("against", "metrics", "trivial", "region", "sequences", "level", "equivalence"),
                 "format",
                 "details",
             ),
-            "baseline",
-            False,
+            *("baseline", False),
         ),
     )
 
@@ -90,18 +76,16 @@ class CompareSettings(BaselineOptions):
 
     def margins(self) -> dict[str, float]:
         """Margins of equivalence by metric. Raises `ValueError` for words that are not METRIC=MARGIN with a positive margin."""
-        found = {}
+        margins = {}
         for word in self.equivalence:
             metric, _, number = word.partition("=")
-            try:
-                found[metric] = float(number)
-            except ValueError:
-                found[metric] = math.nan
-            if not (metric and math.isfinite(found[metric]) and found[metric] > 0):
+            with suppress(ValueError):
+                margins[metric] = float(number)
+            if not metric or not 0 < margins.get(metric, 0.0) < math.inf:
                 raise ValueError(
                     f"equivalence is {word}; METRIC=MARGIN with a positive number, such as psnr=0.3"
                 )
-        return found
+        return margins
 
 
 FIELDS = (
@@ -113,71 +97,85 @@ FIELDS = (
 
 @command("compare", group="compare")
 def compare_runs(settings: CompareSettings, progress: Progress = no_progress) -> CommandResult:
-    """Test differences between methods, or compare a run with a baseline file (CI).
-
-    Raises `InputError` for invalid combinations of runs, methods and metrics.
-    """
+    """Test differences between methods, or compare a run with a baseline file (CI)."""
     if settings.baseline is not None:
         from ...bench.gate.command import compare_with_baseline
 
         return compare_with_baseline(Path(settings.runs[0]), Path(settings.baseline), settings)
     part = FrameSelection(settings.region, settings.sequences)
-    return compare_methods(RunSet.read([Path(folder) for folder in settings.runs], part), settings, progress)
+    runs = RunSet.read([Path(folder) for folder in settings.runs], part)
+    return compare_methods(
+        runs,
+        settings.against,
+        metrics=settings.metrics,
+        trivial=settings.trivial,
+        level=settings.level,
+        margins=settings.margins(),
+        csv=settings.format == "csv",
+        progress=progress,
+    )
 
 
 def compare_methods(
-    runs: RunSet, settings: CompareSettings, progress: Progress = no_progress
+    runs: RunSet,
+    against: str | None = None,
+    *,
+    metrics: Sequence[str] = (),
+    trivial: bool = False,
+    level: float = LEVEL,
+    margins: Mapping[str, float] | None = None,
+    csv: bool = False,
+    progress: Progress = no_progress,
 ) -> CommandResult:
-    """`compare_runs` of loaded runs; runs, region and sequences of the settings are ignored."""
-    runs = runs.by_camera
-    pairs = _pairs(runs, settings.against, settings.trivial)
-    known = {spec.name: spec for spec in runs.metrics}
-    for name in settings.metrics:
-        if name not in known:
-            raise InputError("command line", "--metrics", f"metrics of the runs: {', '.join(known)}", name)
-    asked = settings.metrics or [name for name, spec in known.items() if COMPARISON in spec.tables]
-    metrics = [spec for name, spec in known.items() if name in asked]
-    margins = settings.margins()
+    """`compare_runs` of loaded runs: all pairs of methods, or all methods with ``against``."""
+    runs, margins = runs.by_camera, margins or {}
+    pairs = _pairs(runs, against, trivial)
+    names = [spec.name for spec in runs.metrics]
+    for name in metrics:
+        if name not in names:
+            raise InputError("command line", "--metrics", f"metrics of the runs: {', '.join(names)}", name)
+    compared = metrics or [spec.name for spec in runs.metrics if COMPARISON in spec.tables]
     for name in margins:
-        if name not in asked:
-            raise InputError("command line", "--equivalence", f"compared metrics: {', '.join(asked)}", name)
-    columns = [(task, spec) for task in runs.tasks for spec in metrics if spec.per_frame]
-    columns += [("", spec) for spec in metrics if not spec.per_frame]
-    found: list[tuple[MetricSpec, list[PairedComparison]]] = []
+        if name not in compared:
+            raise InputError(
+                "command line", "--equivalence", f"compared metrics: {', '.join(compared)}", name
+            )
+    specs = [spec for spec in runs.metrics if spec.name in compared]
+    columns = [(task, spec) for task in runs.tasks for spec in specs if spec.per_frame]
+    columns += [("", spec) for spec in specs if not spec.per_frame]
+    families: list[tuple[MetricSpec, list[PairedComparison]]] = []
     for index, (task, spec) in enumerate(columns):
-        compared = compare(
-            runs.rows,
-            pairs,
+        family = compare(
+            *(runs.rows, pairs),
             task=task,
             metric=spec.name,
             higher_is_better=spec.higher_is_better,
-            level=settings.level,
+            level=level,
             margin=margins.get(spec.name),
         )
-        found.append((spec, compared))
+        families.append((spec, family))
         progress(index + 1, len(columns), spec.label)
-    times = conditions(runs.rows, metrics, list(dict.fromkeys(chain(*pairs))))
-    every = []
-    for comparison in chain(*(comparisons for _, comparisons in found)):
-        own = times.get(comparison.metric, {})
-        note = note_of({name: own[name] for name in (comparison.first, comparison.second) if name in own})
-        every.append({**_plain(comparison), "note": note})
-    if settings.format == "csv":
-        text = _csv(every)
+    times = conditions(runs.rows, specs, list(dict.fromkeys(chain(*pairs))))
+    records = []
+    for comparison in chain(*(family for _, family in families)):
+        by_method = times.get(comparison.metric, {})
+        timed = {n: by_method[n] for n in (comparison.first, comparison.second) if n in by_method}
+        records.append({**_plain(comparison), "note": note_of(timed)})
+    if csv:
+        text = _csv(records)
     else:
         blocks = [
-            _text(task, [(spec, own) for spec, own in found if own[0].task == task], settings.level)
+            _text(task, [(spec, family) for spec, family in families if family[0].task == task], level)
             for task in dict.fromkeys(task for task, _ in columns)
         ]
-        notes = [f"{spec.label}: {note}" for spec in metrics if (note := note_of(times.get(spec.name, {})))]
-        subjects = counted(max(c.subjects for _, own in found for c in own), "subject")
+        notes = [f"{spec.label}: {note}" for spec in specs if (note := note_of(times.get(spec.name, {})))]
+        subjects = counted(max(c.subjects for _, family in families for c in family), "subject")
         how = f"p: exact sign-flip test over {subjects}, with Holm's correction for all pairs of a metric and task."
         below = [how, *notes, runs.cameras, runs.part]
         worse = not_better(runs.rows, runs.metrics, runs.ranked, runs.trivial, runs.tasks)
         warnings = ["\n".join([*worse.values(), BELOW_CAUSES])] if worse else []
         text = "\n\n".join([*warnings, *blocks, "\n".join(filter(None, below))])
-    data = {"level": settings.level, "comparisons": every}
-    return CommandResult(text, data, verbatim=settings.format == "csv")
+    return CommandResult(text, {"level": level, "comparisons": records}, verbatim=csv)
 
 
 def _pairs(runs: RunSet, against: str | None, trivial: bool) -> list[tuple[str, str]]:
@@ -196,24 +194,16 @@ def _pairs(runs: RunSet, against: str | None, trivial: bool) -> list[tuple[str, 
 
 def _plain(comparison: PairedComparison) -> dict[str, Any]:
     """All fields and results of a comparison, as JSON values."""
-    return {
-        **asdict(comparison),
-        "differences": dict(comparison.differences),
-        "subjects": comparison.subjects,
-        "wins": comparison.wins,
-        "verdict": comparison.verdict,
-        "equivalent": comparison.equivalent,
-    }
+    derived = {name: getattr(comparison, name) for name in ("subjects", "wins", "verdict", "equivalent")}
+    return {**asdict(comparison), "differences": dict(comparison.differences), **derived}
 
 
 def equivalence_text(comparison: PairedComparison, unit: str) -> str:
     """Outcome of the test of equivalence in words, with its p-value; "" without one."""
     if comparison.margin is None or comparison.p_equivalence_holm is None:
         return ""
-    within = f"{comparison.margin:g} {unit}".rstrip()
-    text = (
-        f"equivalent within {within}" if comparison.equivalent else f"equivalence within {within} not shown"
-    )
+    margin = f"within {comparison.margin:g} {unit}".rstrip()
+    text = f"equivalent {margin}" if comparison.equivalent else f"equivalence {margin} not shown"
     return f"{text} (Holm {comparison.p_equivalence_holm:.4f})"
 
 
@@ -226,10 +216,10 @@ def _csv(comparisons: Sequence[dict[str, Any]]) -> str:
     return csv_text(lines).rstrip()
 
 
-def _text(task: str, found: Sequence[tuple[MetricSpec, Sequence[PairedComparison]]], level: float) -> str:
+def _text(task: str, families: Sequence[tuple[MetricSpec, Sequence[PairedComparison]]], level: float) -> str:
     """The comparisons of a task as a table for a terminal, those of a metric below each other."""
     lines = []
-    for spec, comparisons in found:
+    for spec, comparisons in families:
         unit = f"{spec.unit}, " if spec.unit else ""
         lines.append([f"{spec.label} ({unit}{'higher' if spec.higher_is_better else 'lower'} is better)"])
         for c in comparisons:
@@ -241,14 +231,7 @@ def _text(task: str, found: Sequence[tuple[MetricSpec, Sequence[PairedComparison
             digits = spec.digits + 1
             bounds = "-" if c.low is None or c.high is None else f"{c.low:+.{digits}f} {c.high:+.{digits}f}"
             verdict = "; ".join(filter(None, [c.verdict, equivalence_text(c, spec.unit)]))
-            lines.append(
-                [
-                    name,
-                    f"{c.difference:+.{digits}f}",
-                    bounds,
-                    f"{c.p_holm:.4f}" if c.testable else "-",
-                    verdict,
-                ]
-            )
+            p = f"{c.p_holm:.4f}" if c.testable else "-"
+            lines.append([name, f"{c.difference:+.{digits}f}", bounds, p, verdict])
     heads = ["Methods", "Difference", f"{100 * (1 - level):g} % interval", "p", "Conclusion"]
     return table(heads, lines, title=TASK_TITLES.get(task, task) or AVATAR_TITLE)

@@ -101,15 +101,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def paired_differences(first: pd.DataFrame, second: pd.DataFrame) -> dict[str, float]:
     """First minus second by subject, averaged over the frames of a sequence, then sequences, then seeds.
 
-    Parameters
-    ----------
-    first, second : pandas.DataFrame
-        Rows of two methods, of one metric of one task: one for each frame and seed, or for each subject and seed.
-
-    Raises
-    ------
-    InputError
-        The methods do not have finite values of exactly the same frames for every seed.
+    Rows are of two methods, of one metric of one task: one for each frame and seed, or for each subject and seed. Raises
+    `InputError` unless both methods have finite values of exactly the same frames for every seed.
     """
     frames = [_frames(rows) for rows in (first, second)]
     unmatched = frames[0].symmetric_difference(frames[1])
@@ -172,9 +165,7 @@ class PairedComparison:
     difference: float | None = None  # mean over subjects, in the metric's unit
     low: float | None = None
     high: float | None = None
-    effect: float | None = (
-        None  # mean over standard deviation of the differences (Cohen's d_z); None where that is 0
-    )
+    effect: float | None = None  # Cohen's d_z: mean over standard deviation; None where that is 0
     p: float | None = None  # of the exact sign-flip test, uncorrected
     p_holm: float | None = None  # corrected for the family
     family: int = 0  # comparisons of this metric
@@ -204,12 +195,10 @@ class PairedComparison:
         """The difference, and its interval in brackets if there is one; "–" without a difference."""
         if self.difference is None:
             return "–"
-        interval = (
-            ""
-            if self.low is None or self.high is None
-            else f" ({self.low:+.{digits}f}, {self.high:+.{digits}f})"
-        )
-        return f"{self.difference:+.{digits}f}{interval}"
+        text = f"{self.difference:+.{digits}f}"
+        if self.low is None or self.high is None:
+            return text
+        return f"{text} ({self.low:+.{digits}f}, {self.high:+.{digits}f})"
 
     @property
     def testable(self) -> bool:
@@ -251,24 +240,24 @@ def compare(
     """
     comparisons = []
     tasks = [task, *([minus] if minus else [])]
-    summaries = {
-        name: [summarise(rows, name, metric, each) for each in tasks] for name in dict.fromkeys(chain(*pairs))
-    }
+    summaries = {name: [summarise(rows, name, metric, place) for place in tasks] for name in {*chain(*pairs)}}
     for names in pairs:
         comparison = PairedComparison(
             task, metric, higher_is_better, *names, level, minus=minus, margin=margin
         )
-        absent = [
-            f"{name}: {each.reason}" for name in names for each in summaries[name] if each.value is None
-        ]
-        if absent:
-            comparisons.append(replace(comparison, reason=" ".join(dict.fromkeys(absent))))
+        reasons = [f"{name}: {s.reason}" for name in names for s in summaries[name] if s.value is None]
+        if reasons:
+            comparisons.append(replace(comparison, reason=" ".join(dict.fromkeys(reasons))))
             continue
-        by_subject, *less = (
-            paired_differences(*(whole_images(rows, n, metric, each) for n in names)) for each in tasks
+        by_subject, *subtracted = (
+            paired_differences(*(whole_images(rows, name, metric, place) for name in names))
+            for place in tasks
         )
-        for other in less:
-            by_subject = _interaction(by_subject, other)
+        for other in subtracted:
+            if [*by_subject] != [*other]:
+                expected = f"the same in both tasks: {', '.join(by_subject)}"
+                raise InputError("rows", "subjects", expected, ", ".join(other) or "none")
+            by_subject = {subject: value - other[subject] for subject, value in by_subject.items()}
         values = np.array([*by_subject.values()])
         low, high = interval(values.tolist(), level) or (None, None)
         deviation = float(values.std(ddof=1)) if len(values) > 1 else 0.0
@@ -288,28 +277,20 @@ def compare(
     return as_one_family(comparisons)
 
 
-def _interaction(task: Mapping[str, float], other: Mapping[str, float]) -> dict[str, float]:
-    """Differences in one task minus those in another, by subject. Raises `InputError` unless both have the same subjects."""
-    if [*task] != [*other]:
-        expected = f"the same in both tasks: {', '.join(task)}"
-        raise InputError("rows", "subjects", expected, ", ".join(other) or "none")
-    return {subject: value - other[subject] for subject, value in task.items()}
-
-
 def as_one_family(comparisons: Iterable[PairedComparison]) -> list[PairedComparison]:
     """Apply Holm's correction to all p-values: differences are one family, equivalences another."""
-    given = list(comparisons)
-    tested = [c.p for c in given if c.p is not None]
-    differing = iter(holm(tested))
-    alike = iter(holm([c.p_equivalence for c in given if c.p_equivalence is not None]))
+    members = list(comparisons)
+    tested = [c.p for c in members if c.p is not None]
+    differences = iter(holm(tested))
+    equivalences = iter(holm([c.p_equivalence for c in members if c.p_equivalence is not None]))
     return [
         replace(
             c,
-            p_holm=None if c.p is None else next(differing),
-            p_equivalence_holm=None if c.p_equivalence is None else next(alike),
+            p_holm=None if c.p is None else next(differences),
+            p_equivalence_holm=None if c.p_equivalence is None else next(equivalences),
             family=0 if c.p is None else len(tested),
         )
-        for c in given
+        for c in members
     ]
 
 
@@ -336,13 +317,11 @@ def best_set(means: Mapping[str, Mapping[str, float]], *, higher_is_better: bool
     if rivals * least_p(len(subjects)) > LEVEL:
         return BestSet(None, len(subjects), needed)
     sign = 1 if higher_is_better else -1
-    values = {
-        method: sign * np.array([own[subject] for subject in subjects]) for method, own in means.items()
-    }
-    kept = []
-    for method, own in values.items():
-        leads = [other - own for name, other in values.items() if name != method]
+    values = {name: sign * np.array([of[subject] for subject in subjects]) for name, of in means.items()}
+    best = []
+    for method, scores in values.items():
+        leads = [other - scores for name, other in values.items() if name != method]
         adjusted = holm([sign_flip_p(lead) for lead in leads])
         if not any(p <= LEVEL and lead.mean() > 0 for p, lead in zip(adjusted, leads)):
-            kept.append(method)
-    return BestSet(frozenset(kept), len(subjects), needed)
+            best.append(method)
+    return BestSet(frozenset(best), len(subjects), needed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import chain, product
 from math import sqrt
 from pathlib import Path
 from statistics import fmean, stdev, variance
@@ -27,11 +27,11 @@ from ...bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
 from ...bench.rows import ALL, FULL
 from ..aggregate import means_by_seed, whole_images
 from ..runs import WHOLE, FrameSelection, RunSet, synthetic_settings
-from ..statistics.command import CompareSettings, compare_methods, equivalence_text
+from ..statistics.command import compare_methods, equivalence_text
 from ..statistics.comparisons import LEVEL as TEST_LEVEL
 from ..statistics.comparisons import PairedComparison, as_one_family, compare, subjects_needed
 from ..table_report import Columns, table_of
-from ..tables import Column, Table, TableCell, TableRow
+from ..tables import Table, TableCell, TableRow
 from ..writers import pipe_table, to_markdown
 
 PAIR = ("ours", "ga")
@@ -47,23 +47,19 @@ def primary_comparisons(runs: RunSet) -> list[PairedComparison]:
     specs = {spec.name: spec for spec in runs.metrics}
     if not {*PAIR} <= {*runs.methods} or not {metric for _, metric in PRIMARY} <= {*specs}:
         return []
-    found = [
-        compare(
-            *(runs.rows, [PAIR]),
-            task=task,
-            metric=metric,
-            higher_is_better=specs[metric].higher_is_better,
-            margin=MARGINS.get(metric),
+    comparisons = []
+    for task, metric in PRIMARY:
+        rising, margin = specs[metric].higher_is_better, MARGINS.get(metric)
+        comparisons += compare(
+            runs.rows, [PAIR], task=task, metric=metric, higher_is_better=rising, margin=margin
         )
-        for task, metric in PRIMARY
-    ]
-    return as_one_family(each for (each,) in found)
+    return as_one_family(comparisons)
 
 
 def planned_subjects(runs: RunSet) -> int:
     """Planned number of subjects of the runs' synthetic captures; 0 if not recorded."""
     settings = [synthetic_settings(clip) for run in runs.runs for clip in run.manifest.clips]
-    return max((int(each.get("subjects", 0)) for each in settings), default=0)
+    return max((int(values.get("subjects", 0)) for values in settings), default=0)
 
 
 def primary_table(runs: RunSet) -> str:
@@ -72,13 +68,13 @@ def primary_table(runs: RunSet) -> str:
     As long as planned subjects are missing, the results are interim and have no verdict: testing again after
     each further subject would reject too often.
     """
-    found = primary_comparisons(runs)
-    if not found:
+    endpoints = primary_comparisons(runs)
+    if not endpoints:
         return ""
     specs, planned = {spec.name: spec for spec in runs.metrics}, planned_subjects(runs)
     confidence = f"{100 * (1 - TEST_LEVEL):g} % interval"
     lines = [["endpoint", f"{PAIR[0]} - {PAIR[1]}", confidence, "p", "Holm", "", "equivalence"], ["---"] * 7]
-    for c in found:
+    for c in endpoints:
         spec = specs[c.metric]
         unit = f" ({spec.unit})" if spec.unit else ""
         head = f"{TASK_TITLES.get(c.task, c.task)}, {spec.label}{unit}"
@@ -94,7 +90,7 @@ def primary_table(runs: RunSet) -> str:
         lines.append([head, *numbers, c.verdict, equivalence_text(c, spec.unit)])
     how = (
         "Intervals are Student's t intervals over subjects, not corrected for multiple comparisons; they may exclude 0 where the test does "
-        f"not reject. Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in found)} endpoints with values; "
+        f"not reject. Exact sign-flip tests over subjects, Holm over the {sum(c.p is not None for c in endpoints)} endpoints with values; "
         "equivalence by two one-sided sign-flip tests, which assume that subjects differ symmetrically about the mean, Holm over "
         f"these; level {TEST_LEVEL:.0%}."
     )
@@ -107,11 +103,8 @@ def primary_section(runs: RunSet) -> str:
         "All other tests on this page are exploratory. They are corrected over the comparisons of one metric and task, "
         "including the primary endpoints."
     )
-    table = (
-        primary_table(runs)
-        or f"These runs have none: primary endpoints compare `{PAIR[0]}` with `{PAIR[1]}`."
-    )
-    return f"## Primary endpoints\n\n{table} {exploratory}"
+    none = f"These runs have none: primary endpoints compare `{PAIR[0]}` with `{PAIR[1]}`."
+    return f"## Primary endpoints\n\n{primary_table(runs) or none} {exploratory}"
 
 
 FOLDER = "extremes"
@@ -121,9 +114,9 @@ KEPT = ("subject", "method", "seed", "frames", "frames_broken", "measures", "mis
 
 def read_extremes(runs: Sequence[Path]) -> list[dict[str, Any]]:
     """Records of all avatars of some runs; none for a run without that test."""
-    places = [run / FOLDER / RECORD_FILE for run in runs]
-    found = [avatar for place in places if place.is_file() for avatar in read_json(place)["avatars"]]
-    return [{name: avatar[name] for name in KEPT if name in avatar} for avatar in found]
+    files = [run / FOLDER / RECORD_FILE for run in runs]
+    avatars = [avatar for file in files if file.is_file() for avatar in read_json(file)["avatars"]]
+    return [{name: avatar[name] for name in KEPT if name in avatar} for avatar in avatars]
 
 
 def extremes_section(avatars: Sequence[Mapping[str, Any]]) -> str:
@@ -136,32 +129,23 @@ def extremes_section(avatars: Sequence[Mapping[str, Any]]) -> str:
         by_method.setdefault(avatar["method"], []).append(avatar)
     rows: list[list[str]] = []
     notes: dict[str, None] = {}
-    for method, own in by_method.items():
-        for note in (avatar.get("missing") or avatar.get("no_truth") for avatar in own):
+    for method, of_method in by_method.items():
+        for note in (avatar.get("missing") or avatar.get("no_truth") for avatar in of_method):
             if note:
                 notes[f"`{method}`: {note}"] = None
-        shown = [avatar for avatar in own if "missing" not in avatar]
-        measures = dict.fromkeys(name for avatar in shown for name in avatar["measures"])
-        for name in measures:
-            found = [avatar["measures"][name] for avatar in shown if name in avatar["measures"]]
-            means = [each["mean"] for each in found if each["mean"] is not None]
-            worst = [(each["mean"] or 0.0, each["worst"]) for each in found if each["worst"] is not None]
+        rendered = [avatar["measures"] for avatar in of_method if "missing" not in avatar]
+        for name in dict.fromkeys(chain(*rendered)):
+            measured = [measures[name] for measures in rendered if name in measures]
+            means = [m["mean"] for m in measured if m["mean"] is not None]
+            worst = [(m["mean"] or 0.0, m["worst"]) for m in measured if m["worst"] is not None]
             if not means or not worst:
                 continue
             # If the worst value is the lowest, higher is better.
             lowest = sum(low <= mean for mean, low in worst) * 2 > len(worst)
             extreme = (min if lowest else max)(value for _, value in worst)
-            counts = f"{sum(each['failed'] for each in found)} of {sum(each['frames'] for each in found)}"
-            rows.append(
-                [
-                    method,
-                    name.replace("_", " "),
-                    str(len(means)),
-                    f"{fmean(means):.3f}",
-                    f"{extreme:.3f}",
-                    counts,
-                ]
-            )
+            counts = f"{sum(m['failed'] for m in measured)} of {sum(m['frames'] for m in measured)}"
+            numbers = [str(len(means)), f"{fmean(means):.3f}", f"{extreme:.3f}", counts]
+            rows.append([method, name.replace("_", " "), *numbers])
     if not rows:
         return ""
     lines = [["method", "measure", "subjects", "mean", "worst", "frames that exceed the limit"], ["---"] * 6]
@@ -179,16 +163,9 @@ FIRST_TASK = "novel_view"
 
 
 def ablation_table(runs: RunSet, method: str, names: Mapping[str, str], *, crossed: bool = False) -> Table:
-    """Differences of ablations from a method, as `difference_table`.
+    """Differences of ablations from a method, as `difference_table`; ``runs`` have only these.
 
-    Parameters
-    ----------
-    runs : RunSet
-        A run with only ``method`` itself and its ablations.
-    method : str
-        Label of the method, including its condition of tracking for ablations under this condition.
-    names : mapping of str
-        Name of each ablation by its label.
+    ``method`` is the label with its condition of tracking, ``names`` has the name of each ablation by its label.
     """
     pairs = [(label, method) for label in names]
     meaning = meaning_of("Ablation minus method")
@@ -215,54 +192,42 @@ def difference_table(
 ) -> Table:
     """Paired differences, in the machine-independent columns of the comparison table.
 
-    ``crossed``: differences in novel views minus those in self-reenactment, which show whether a change helps more in one of
-    the tasks. Speeds are left out, since those of consecutive runs of the same method differ by up to a tenth.
-
-    Parameters
-    ----------
-    runs : RunSet
-        A run with the labels of ``pairs`` alone.
-    pairs : sequence of tuple of str
-        Pairs of labels, with one row for each difference, first minus second.
-    names : mapping of str
-        Name of each row by the first label.
-    title, meaning, family : str
-        Heading of the rows; sentence about the cells; family of the correction of a column's tests.
+    ``runs`` have the labels of ``pairs`` alone; each pair is a row, first minus second, named after the first label by
+    ``names`` under the heading ``title``. ``meaning`` is a sentence about the cells, ``family`` that of the correction of a
+    column's tests. ``crossed``: differences in novel views minus those in self-reenactment, which show whether a change helps
+    more in one of the tasks. Speeds are left out, since those of consecutive runs of the same method differ by up to a tenth.
     """
     runs = runs.by_camera
     table = table_of(runs)
     bound = {spec.name for spec in runs.metrics if spec.machine_bound}
-    kept = tuple(column for column in table.columns if column.metric not in bound)
+    offered = [column for column in table.columns if column.metric not in bound]
     if crossed:
-        others = [column for column in kept if column.task not in ("", FIRST_TASK)]
-        kept = tuple(replace(c, title=f"{TASK_TITLES[FIRST_TASK]} minus {c.title.lower()}") for c in others)
-    shown, columns, tested = [], [], []
-    for column in kept:
-        found = compare(
-            *(runs.rows, pairs),
-            task=FIRST_TASK if crossed else column.task,
-            minus=column.task if crossed else "",
-            metric=column.metric,
-            higher_is_better=column.higher_is_better,
-            level=TEST_LEVEL,
+        others = [column for column in offered if column.task not in ("", FIRST_TASK)]
+        offered = [replace(c, title=f"{TASK_TITLES[FIRST_TASK]} minus {c.title.lower()}") for c in others]
+    columns, cells_of, tested = [], [], []
+    for column in offered:
+        task, minus = (FIRST_TASK, column.task) if crossed else (column.task, "")
+        metric, rising = column.metric, column.higher_is_better
+        comparisons = compare(
+            runs.rows, pairs, task=task, metric=metric, minus=minus, higher_is_better=rising
         )
-        if not column.task and all(each.difference is None for each in found):
+        if not column.task and all(c.difference is None for c in comparisons):
             continue  # metrics of coded avatars, which conditions do not have
-        shown.append(column)
-        columns.append([_cell(each, column.digits) for each in found])
-        tested += [each for each in found if each.p_holm is not None]
+        columns.append(column)
+        cells_of.append([_cell(c, column.digits) for c in comparisons])
+        tested += [c for c in comparisons if c.p_holm is not None]
     versions = {row.method: row.version for row in table.rows}
     rows = tuple(
         TableRow(names[label], versions[label], False, cells)
-        for (label, _), cells in zip(pairs, zip(*columns), strict=True)
+        for (label, _), cells in zip(pairs, zip(*cells_of), strict=True)
     )
     marking = _marking(tested, meaning, family)
-    return replace(table, columns=tuple(shown), groups=((title, rows),), notes=(), marking=marking)
+    return replace(table, columns=tuple(columns), groups=((title, rows),), notes=(), marking=marking)
 
 
 def _marking(tested: Sequence[PairedComparison], meaning: str, family: str) -> str:
     test = f"exact sign-flip test over subjects, Holm over the {family} of a column, {TEST_LEVEL:.0%}"
-    if any(each.testable for each in tested) or not tested:
+    if any(comparison.testable for comparison in tested) or not tested:
         return f"{meaning} Bold: not 0 ({test})."
     first = tested[0]
     needed = subjects_needed(TEST_LEVEL, first.family)
@@ -270,13 +235,12 @@ def _marking(tested: Sequence[PairedComparison], meaning: str, family: str) -> s
     return f"{meaning} {subjects} are too few to test whether they differ from 0 (needed: {needed}; {test})."
 
 
-def _cell(found: PairedComparison, digits: int) -> TableCell:
-    if found.difference is None:
-        return TableCell("missing", None, found.reason)
+def _cell(comparison: PairedComparison, digits: int) -> TableCell:
+    if comparison.difference is None:
+        return TableCell("missing", None, comparison.reason)
+    differs = comparison.p_holm is not None and comparison.p_holm <= TEST_LEVEL
     # One digit more than the table, since differences are smaller than values.
-    text = found.text(digits + 1)
-    differs = found.p_holm is not None and found.p_holm <= TEST_LEVEL
-    return TableCell("ok", found.difference, text, rank=1 if differs else None)
+    return TableCell("ok", comparison.difference, comparison.text(digits + 1), rank=1 if differs else None)
 
 
 COMPARED = "psnr"
@@ -292,40 +256,37 @@ def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
     spec = next((spec for spec in runs.metrics if spec.name == COMPARED), None)
     if spec is None or len(runs.rows.seeds(ALL)) < 2:
         return ""
-    lines = [
-        ["", "task", "subjects", "seeds", f"mean ({spec.unit})", "SD between subjects", "SD within subjects"]
+    heads = [
+        "",
+        "task",
+        "subjects",
+        "seeds",
+        f"mean ({spec.unit})",
+        "SD between subjects",
+        "SD within subjects",
     ]
-    lines.append(["---"] * len(lines[0]))
+    lines = [heads, ["---"] * len(heads)]
     for task in runs.tasks:
         values = {
             method: means_by_seed(whole_images(runs.rows, method, COMPARED, task)) for method in runs.ranked
         }
         if {*pair} <= {*values}:
-            values[f"{pair[0]} - {pair[1]}"] = difference_by_seed(values, pair)
+            first, second = (values[name] for name in pair)
+            values[f"{pair[0]} - {pair[1]}"] = {
+                seed: {s: first[seed][s] - second[seed][s] for s in first[seed].keys() & second[seed].keys()}
+                for seed in first.keys() & second.keys()
+            }
         for name, by_seed in values.items():
-            if found := components(by_seed):
-                subjects, mean, between, within = found
-                shown = f"{mean:+.2f}" if name not in runs.ranked else f"{mean:.2f}"
-                counts = [str(subjects), str(len(by_seed))]
-                title = TASK_TITLES.get(task, task)
-                lines.append([name, title, *counts, shown, f"{between:.3f}", f"{within:.3f}"])
-    table = pipe_table(lines)
+            if parts := components(by_seed):
+                subjects, mean, between, within = parts
+                place = [name, TASK_TITLES.get(task, task), str(subjects), str(len(by_seed))]
+                text = f"{mean:+.2f}" if name not in runs.ranked else f"{mean:.2f}"
+                lines.append([*place, text, f"{between:.3f}", f"{within:.3f}"])
     how = (
         "Standard deviations: between subjects, of the means over seeds; within subjects, over seeds, pooled. "
         "Differences are between trainings with the same seed."
     )
-    return f"## Variance between and within subjects (exploratory)\n\n{table}\n\n{how}"
-
-
-def difference_by_seed(
-    values: Mapping[str, Mapping[int, Mapping[str, float]]], pair: tuple[str, str]
-) -> dict[int, dict[str, float]]:
-    """First minus second of a pair by seed and subject."""
-    first, second = (values[name] for name in pair)
-    return {
-        seed: {s: first[seed][s] - second[seed][s] for s in first[seed].keys() & second[seed].keys()}
-        for seed in first.keys() & second.keys()
-    }
+    return f"## Variance between and within subjects (exploratory)\n\n{pipe_table(lines)}\n\n{how}"
 
 
 def components(by_seed: Mapping[int, Mapping[str, float]]) -> tuple[int, float, float, float] | None:
@@ -334,52 +295,41 @@ def components(by_seed: Mapping[int, Mapping[str, float]]) -> tuple[int, float, 
     if len(by_seed) < 2 or len(subjects) < 2:
         return None
     values = {subject: [means[subject] for means in by_seed.values()] for subject in subjects}
-    centres = [fmean(own) for own in values.values()]
-    within = sqrt(fmean(variance(own) for own in values.values()))
+    centres = [fmean(of_seeds) for of_seeds in values.values()]
+    within = sqrt(fmean(variance(of_seeds) for of_seeds in values.values()))
     return len(subjects), fmean(centres), stdev(centres), within
 
 
-NOVEL, METRIC = "novel_view", "psnr"
 DROP = "Drop"
 DROP_MEANING = f"{DROP} to a task: novel views minus that task."
 
 
 def drop_table(runs: RunSet) -> Table:
     """PSNR of all tasks, and a last column for each other task: novel views minus that task."""
-    table = table_of(runs, columns=Columns((METRIC,)))
-    (first,) = (place for place, column in enumerate(table.columns) if column.task == NOVEL)
-    others = [place for place in range(len(table.columns)) if place != first]
-
-    def drop(place: int) -> Column:
-        shown = table.columns[place]
-        title = f"{DROP} to {shown.title.lower()}"
-        return Column("", title, METRIC, shown.label, shown.unit, shown.digits, higher_is_better=False)
+    table = table_of(runs, columns=Columns((COMPARED,)))
+    (first,) = (index for index, column in enumerate(table.columns) if column.task == FIRST_TASK)
+    others = [index for index in range(len(table.columns)) if index != first]
+    columns = [table.columns[index] for index in others]
+    drops = (
+        replace(c, task="", title=f"{DROP} to {c.title.lower()}", higher_is_better=False) for c in columns
+    )
 
     def with_drops(row: TableRow) -> TableRow:
-        return replace(row, cells=(*row.cells, *(_difference(row, first, place, table) for place in others)))
+        cells, novel = list(row.cells), row.cells[first].value
+        for index in others:
+            other = row.cells[index].value
+            if novel is None or other is None:
+                cells.append(TableCell("missing", None, "–"))
+            else:
+                text = f"{novel - other:.{table.columns[index].digits}f}"
+                cells.append(TableCell("ok", novel - other, text))
+        return replace(row, cells=tuple(cells))
 
-    columns = (*table.columns, *map(drop, others))
-    return replace(table.mapped(with_drops), columns=columns)
-
-
-def _difference(row: TableRow, first: int, second: int, table: Table) -> TableCell:
-    novel, other = row.cells[first].value, row.cells[second].value
-    if novel is None or other is None:
-        return TableCell("missing", None, "–")
-    difference = novel - other
-    return TableCell("ok", difference, f"{difference:.{table.columns[second].digits}f}")
+    return replace(table.mapped(with_drops), columns=(*table.columns, *drops))
 
 
 def condition_table(runs: RunSet, changed: Mapping[str, str], title: str) -> Table:
-    """Effects of a condition, one row per method.
-
-    Parameters
-    ----------
-    changed : mapping of str
-        Label of the method under the condition by its plain label.
-    title : str
-        Heading of the rows.
-    """
+    """Effects of a condition, one row per method; ``changed`` has the label under the condition by the plain label."""
     pairs = [(label, method) for method, label in changed.items()]
     names = {label: method for method, label in changed.items()}
     return difference_table(
@@ -410,12 +360,8 @@ CONDITION_TEXTS = {
 """Title of the section of a condition, and what methods are under it; all others are levels of tracking errors."""
 AVATAR_TABLES = {
     "cost": (
-        "training_processor",
-        "training_iterations",
-        "training_time",
-        "storage",
-        "storage_coded",
-        "coded_change",
+        *("training_processor", "training_iterations", "training_time"),
+        *("storage", "storage_coded", "coded_change"),
     ),
     "speed": ("fps", "fps_one_thread", "fps_without_head", "processor_time"),
     "mechanism": ("dynamic_splats", "opacity_range", "color_range", "position_range"),
@@ -429,8 +375,8 @@ def suite_runs(folder: Path, base: str = RUN) -> list[Path]:
     A suite of earlier versions has one run for all subjects.
     """
     place = folder / base
-    places = [place, *sorted(place.iterdir())] if place.is_dir() else []
-    return [each for each in places if RunFolder(each).rows.is_file()]
+    folders = [place, *sorted(place.iterdir())] if place.is_dir() else []
+    return [run for run in folders if RunFolder(run).rows.is_file()]
 
 
 def suite_report(folder: Path, method: str, read: Callable[[Sequence[Path]], RunSet] = RunSet.read) -> str:
@@ -438,16 +384,7 @@ def suite_report(folder: Path, method: str, read: Callable[[Sequence[Path]], Run
 
     The primary endpoints are first; everything else is labelled as exploratory. Each table is followed by the paired
     differences of all other methods from ``method``, with intervals and tests. Ablations and conditions have such differences
-    for whole frames and the face; for whole frames also in each held-out sequence.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the suite.
-    method : str
-        Label of the reference method.
-    read : callable
-        Reads runs together.
+    for whole frames and the face; for whole frames also in each held-out sequence. ``read`` reads runs together.
     """
     runs, large, seeds = (suite_runs(folder, base) for base in (RUN, LARGE_RUN, SEEDS_RUN))
     text = _tables(read(runs), method, primary=True)
@@ -487,16 +424,16 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
         labels = [label for label in ({**same, **equal}).values() if label not in whole.trivial]
         sections.append(_section("Equal iterations", whole.only(labels).shared.without_conditions, method))
     for layout, names in AVATAR_TABLES.items():
-        if shown := tuple(spec.name for spec in runs.metrics if spec.name in names and layout in spec.tables):
-            text = to_markdown(table_of(runs, layout, columns=Columns(shown))).strip()
+        if columns := tuple(m.name for m in runs.metrics if m.name in names and layout in m.tables):
+            text = to_markdown(table_of(runs, layout, columns=Columns(columns))).strip()
             sections.append(f"## {layout.capitalize()} (exploratory)\n\n{text}")
     regions = (FULL, *({"face"} & runs.rows.regions))
     tracking = [c for c in by_condition if c == TRACKED or c.startswith(LEVEL_START)]
     for condition in (*tracking, *({AS_TRACKED} & {*by_condition})):
         changed = {name: label for name, label in by_condition[condition].items() if name in plain}
-        own = whole.only([*changed, *changed.values()]).shared
+        pairs = whole.only([*changed, *changed.values()]).shared
         for region in regions:
-            sections.append(_condition_section(own.of(FrameSelection(region)), condition, changed, region))
+            sections.append(_condition_section(pairs.of(FrameSelection(region)), condition, changed, region))
     ablations: dict[tuple[str, str], dict[str, str]] = {}
     """Name of each ablation by its label, by condition of tracking and method."""
     for condition, by_name in by_condition.items():
@@ -505,8 +442,8 @@ def _tables(read: RunSet, method: str, *, primary: bool) -> str:
             for name, label in by_name.items():
                 ablations.setdefault((under, name), {})[label] = condition.removesuffix(f"-{under}")
     for under, name in sorted(ablations, key=lambda place: ["", *tracking].index(place[0])):
-        parts_shown, named = tested if not under else (), ablations[under, name]
-        sections += _ablation_sections(whole, by_condition[under][name], named, regions, parts_shown)
+        sequences, names_of = tested if not under else (), ablations[under, name]
+        sections += _ablation_sections(whole, by_condition[under][name], names_of, regions, sequences)
     return "\n\n".join(sections) + "\n"
 
 
@@ -515,15 +452,16 @@ def _ablation_sections(
 ) -> list[str]:
     """Differences of ablations from a method: whole frames and regions, each held-out sequence, and between the tasks."""
     runs = whole.only([method, *names]).shared
-    chosen = [(region, parts) for region, parts in product(regions, ((), *((name,) for name in tested)))]
-    tables = {_title("", region, *parts): FrameSelection(region, parts) for region, parts in chosen}
-    found = {title: ablation_table(runs.of(part), method, names) for title, part in tables.items()}
+    tables = {}
+    for region, sequences in product(regions, ((), *((name,) for name in tested))):
+        part = FrameSelection(region, sequences)
+        tables[_title("", region, *sequences)] = ablation_table(runs.of(part), method, names)
     for region in regions:
         title = f"{_title('', region)}, {CROSSED}"
-        found[title] = ablation_table(runs.of(FrameSelection(region)), method, names, crossed=True)
+        tables[title] = ablation_table(runs.of(FrameSelection(region)), method, names, crossed=True)
     return [
         f"## Ablations of {method}{title} (exploratory)\n\n{to_markdown(table).strip()}"
-        for title, table in found.items()
+        for title, table in tables.items()
     ]
 
 
@@ -532,15 +470,12 @@ def _machines(runs: RunSet) -> str:
     trained = runs.rows.select(
         method=ALL, condition=ALL, metric="training_time", task="", region=FULL, seeds=ALL
     )
-    machines: dict[str, set[str]] = {}
-    for subject, machine in zip(trained["subject"], trained["machine"]):
-        machines.setdefault(str(subject), set()).add(str(machine))
-    known: dict[str, list[str]] = {}
-    for subject, found in machines.items():
+    by_machine: dict[str, list[str]] = {}
+    for subject, rows in trained.groupby("subject", sort=False):
         # An interrupted training has no time, and thus no machine.
-        for machine in sorted(found - {""}) or ["unknown processors"]:
-            known.setdefault(machine, []).append(subject)
-    listed = [f"{machine}: subjects {', '.join(subjects)}" for machine, subjects in known.items()]
+        for machine in sorted({*map(str, rows["machine"])} - {""}) or ["unknown processors"]:
+            by_machine.setdefault(machine, []).append(str(subject))
+    listed = [f"{machine}: subjects {', '.join(subjects)}" for machine, subjects in by_machine.items()]
     return f"Trained on: {'; '.join(listed) or 'unknown processors'}."
 
 
@@ -552,14 +487,9 @@ def _condition_section(runs: RunSet, condition: str, changed: Mapping[str, str],
         f"trained and driven with simulated tracking errors of level {level}",
     )
     title, what = CONDITION_TEXTS.get(condition, of_level)
-    meaning = f"Under the condition `{condition}`, methods are {what}."
-    tables = (drop_table(runs), condition_table(runs, changed, title))
-    texts = [
-        f"## {_title(title, region)} (exploratory)",
-        f"{meaning} {DROP_MEANING}",
-        *map(to_markdown, tables),
-    ]
-    return "\n\n".join(map(str.strip, texts))
+    meaning = f"Under the condition `{condition}`, methods are {what}. {DROP_MEANING}"
+    tables = map(to_markdown, (drop_table(runs), condition_table(runs, changed, title)))
+    return "\n\n".join(map(str.strip, [f"## {_title(title, region)} (exploratory)", meaning, *tables]))
 
 
 def _title(text: str, region: str, *chosen: str) -> str:
@@ -571,6 +501,4 @@ def _section(title: str, runs: RunSet, method: str, note: str = "") -> str:
     text = f"## {title} (exploratory)\n\n{to_markdown(table_of(runs)).strip()}"
     if method not in runs.ranked or len(runs.ranked) < 2:
         return text
-    folders = tuple(str(run.folder.root) for run in runs.runs)
-    compared = compare_methods(runs, CompareSettings(folders, against=method))
-    return "\n\n".join(filter(None, [text, note, f"```text\n{compared.text}\n```"]))
+    return "\n\n".join(filter(None, [text, note, f"```text\n{compare_methods(runs, method).text}\n```"]))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 import tyro
@@ -38,35 +38,25 @@ class ViewSettings(RunOptions):
 
     avatars: tyro.conf.Positional[tuple[str, ...]]
     """Folders of runs, or of avatars as `headbench render` takes them; an imported avatar needs --data, its capture."""
-
     methods: tuple[str, ...] = ()
     """Only these methods of runs; by default all but the trivial baselines."""
-
     subjects: tuple[str, ...] = ()
     """Only these subjects of runs; by default the first."""
-
     source: str | None = None
     """Capture of another subject, with the same head model, whose sequences drive the avatars too."""
-
     live: str = ""
     """Live signal that drives all avatars: lines of JSON, each a frame as `headbench drive` reads them, on standard input (-) or on
     a port of this machine (a number), at which only programs of this machine can connect."""
-
     signal_head: str = ""
     """With --live: head model of the signal, as of `headbench drive`."""
-
     expressions: int = 10
     """Number of sliders for expressions of each head model: the named ones, else the single coefficients, that move it farthest."""
-
     method: str = ""
     """Method of an avatar outside of runs as package.module:SPEC, where it is not registered."""
-
     device: str = ""
     """Rendering device; by default that of the training."""
-
     port: int = 8080
     """Port of this machine to listen at; 0 takes a free one. Only browsers of this machine can connect."""
-
     seconds: float | None = None
     """Stop after this time; by default when interrupted."""
 
@@ -99,37 +89,17 @@ Recording = dict[int, dict[str, FrameKey]]
 """The frames of one sequence of a subject: keys by timestep and camera."""
 
 
-class LiveSource(Protocol):
-    """Where live poses come from, see `live.LivePoses`."""
-
-    def pose(self, version: str) -> HeadPose | None:
-        """The latest pose of a head model; None before the first."""
-
-    def listen(self, listener: Callable[[], None]) -> None:
-        """Call ``listener`` after each new pose."""
-
-    def forget(self, listener: Callable[[], None]) -> None:
-        """Call ``listener`` no more."""
-
-
 @dataclass(frozen=True)
 class Sliders:
     """Offsets added to a pose. Angles in radians, added to axis-angle vectors.
 
-    Attributes
-    ----------
-    expressions : Mapping[str, tuple[float, ...]]
-        Coefficients by head model, in the model's units; only the leading ones if they are fewer.
-    jaw, neck : tuple[float, ...]
-        (3,) rotations about x, y and z.
-    eyes : tuple[float, ...]
-        (2,) rotations of both eyes about x and y.
+    ``expressions`` are coefficients by head model, in the model's units; only the leading ones if they are fewer.
     """
 
     expressions: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    jaw: tuple[float, ...] = (0.0, 0.0, 0.0)
+    jaw: tuple[float, ...] = (0.0, 0.0, 0.0)  # rotations about x, y and z
     neck: tuple[float, ...] = (0.0, 0.0, 0.0)
-    eyes: tuple[float, ...] = (0.0, 0.0)
+    eyes: tuple[float, ...] = (0.0, 0.0)  # rotations of both eyes about x and y
 
     @property
     def at_rest(self) -> bool:
@@ -141,8 +111,8 @@ class Sliders:
         if self.at_rest:
             return pose
         expression = np.array(pose.expression, np.float64)
-        given = self.expressions.get(pose.head_model, ())[: len(expression)]
-        expression[: len(given)] += given
+        leading = self.expressions.get(pose.head_model, ())[: len(expression)]
+        expression[: len(leading)] += leading
         x, y = self.eyes
         return replace(
             pose,
@@ -175,47 +145,26 @@ class FreeView:
 
 @dataclass(frozen=True)
 class State:
-    """Everything that determines the image.
-
-    Attributes
-    ----------
-    recording, timestep : str or int
-        Sequence that animates the avatar and its timestep; `NEUTRAL` and 0 for none.
-    camera : str
-        Camera of the capture, drawn as for metrics, with the captured image next to it; "" for the
-        free view.
-    background : tuple[float, float, float]
-        RGB, each in [0, 1].
-    splats : bool
-        Whether browsers render the splats.
-    """
+    """Everything that determines the image."""
 
     sliders: Sliders = field(default_factory=Sliders)
-    recording: str = NEUTRAL
+    recording: str = NEUTRAL  # sequence that animates the avatar
     timestep: int = 0
-    camera: str = ""
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    splats: bool = False
+    camera: str = ""  # of the capture, drawn as for metrics beside the captured image; "" for the free view
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)  # RGB, each in [0, 1]
+    splats: bool = False  # whether browsers render the splats
 
 
 @dataclass(frozen=True, eq=False)
 class ShownAvatar:
-    """An avatar, its clip, and that clip adapted to its method.
+    """An avatar, its clip, and that clip adapted to its method."""
 
-    Attributes
-    ----------
-    label : str
-        Unique name.
-    sources : Mapping[str, AdaptedClip]
-        Clips of other subjects, adapted to its method, by subject.
-    """
-
-    label: str
+    label: str  # unique
     avatar: Avatar
     clip: Clip
     form: AdaptedClip
-    sources: Mapping[str, AdaptedClip]
-    live: LiveSource | None = None  # poses of the live signal, if there is one
+    sources: Mapping[str, AdaptedClip]  # clips of other subjects, adapted to its method, by subject
+    live: Any = None  # the `server.LivePoses` of the live signal, if there is one
 
     @property
     def version(self) -> str:
@@ -255,14 +204,10 @@ class ShownAvatar:
 
         For a method with one video, the head is fixed and the camera moves.
         """
-        own = key if key is not None and key.subject == self.clip.subject else self._first
-        seen = self.form.clip.cameras[self.form.key(own).camera].world_to_camera
-        return replace(
-            view,
-            world_to_camera=view.world_to_camera
-            @ np.linalg.inv(self.clip.cameras[own.camera].world_to_camera)
-            @ seen,
-        )
+        frame = key if key is not None and key.subject == self.clip.subject else self._first
+        adapted = self.form.clip.cameras[self.form.key(frame).camera].world_to_camera
+        to_world = np.linalg.inv(self.clip.cameras[frame.camera].world_to_camera)
+        return replace(view, world_to_camera=view.world_to_camera @ to_world @ adapted)
 
     @property
     def _first(self) -> FrameKey:
@@ -276,17 +221,11 @@ class ShownAvatar:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The avatars shown, in order, and the recordings by name.
-
-    Attributes
-    ----------
-    missing : Sequence[str]
-        Avatars of the runs that are missing, each with the reason.
-    """
+    """The avatars shown, in order, and the recordings by name."""
 
     shown: Sequence[ShownAvatar]
     recordings: Mapping[str, Recording]
-    missing: Sequence[str]
+    missing: Sequence[str]  # avatars of the runs that are missing, each with the reason
 
     @property
     def first(self) -> ShownAvatar:
@@ -295,31 +234,24 @@ class Scene:
 
     def expressions(self, count: int) -> dict[str, list[Expression]]:
         """The strongest expressions of each head model, by its version; ranges are those of the training of the first avatar."""
-        found: dict[str, list[Expression]] = {}
-        for shown in self.shown:
-            if shown.version not in found:
-                poses = training_poses(shown.form.clip)
-                found[shown.version] = expressions_of(shown.form.clip.head, count, poses)
-        return found
+        first = {shown.version: shown.form.clip for shown in reversed(self.shown)}
+        versions = dict.fromkeys(shown.version for shown in self.shown)
+        return {v: expressions_of(first[v].head, count, training_poses(first[v])) for v in versions}
 
 
 def open_scene(settings: ViewSettings, kept: Path) -> Scene:
-    """Load the requested avatars; ``kept`` is a folder for tracking that has to be refitted.
-
-    Raises `InputError` without avatars, or with more than `MOST_SHOWN`.
-    """
+    """Load the requested avatars, at most `MOST_SHOWN`; ``kept`` is a folder for tracking that has to be refitted."""
     missing: list[str] = []
     shown: list[ShownAvatar] = []
     for number, name in enumerate(settings.avatars):
         shown += _opened(Path(name), settings, kept / str(number), missing)
+    folders = " ".join(settings.avatars)
     if not shown:
-        found = "; ".join(missing) or "none"
-        raise InputError(" ".join(settings.avatars), "", "a trained avatar", found, "Start the run again.")
+        reasons = "; ".join(missing) or "none"
+        raise InputError(folders, "", "a trained avatar", reasons, "Start the run again.")
     if len(shown) > MOST_SHOWN:
-        remedy = "Choose with --methods and --subjects."
-        raise InputError(
-            " ".join(settings.avatars), "", f"at most {MOST_SHOWN} avatars", str(len(shown)), remedy
-        )
+        expected, remedy = f"at most {MOST_SHOWN} avatars", "Choose with --methods and --subjects."
+        raise InputError(folders, "", expected, str(len(shown)), remedy)
     for reason in missing:
         log.warning("not shown: %s", reason)
     if len({avatar.label for avatar in shown}) < len(shown):
@@ -345,9 +277,8 @@ def _opened(path: Path, settings: ViewSettings, kept: Path, missing: list[str]) 
     config = replace(config, device=settings.device or config.device)
     source = _source(settings, config)
     seeds = (cell[2],) if cell else config.seeds
-    for job in make_jobs(
-        replace(config, seeds=seeds), [(m, PLAIN) for m in methods], clips, {}, RunFolder(run), kept
-    ):
+    cells = [(method, PLAIN) for method in methods]
+    for job in make_jobs(replace(config, seeds=seeds), cells, clips, {}, RunFolder(run), kept):
         if not job.cell.is_trained:
             why = "its training did not end" if "state" in job.cell.record else "not trained"
             missing.append(f"{job.name}: {why}")
@@ -357,14 +288,11 @@ def _opened(path: Path, settings: ViewSettings, kept: Path, missing: list[str]) 
         except HeadbenchError as error:
             missing.append(f"{job.name}: {error}")
             continue
-        label = " ".join(
-            [job.method.spec.name]
-            + ([job.clip.subject] if len(wanted) > 1 or len(settings.avatars) > 1 else [])
-            + ([f"seed {job.seed}"] if len(seeds) > 1 else [])
-        )
-        yield ShownAvatar(
-            label, avatar, job.clip, job.form, _driving(source, job.clip, job.method, config, kept)
-        )
+        label = job.method.spec.name
+        label += f" {job.clip.subject}" * (len(wanted) > 1 or len(settings.avatars) > 1)
+        label += f" seed {job.seed}" * (len(seeds) > 1)
+        sources = _driving(source, job.clip, job.method, config, kept)
+        yield ShownAvatar(label, avatar, job.clip, job.form, sources)
 
 
 def _run_of(path: Path) -> tuple[Path | None, tuple[str, str, int] | None]:
@@ -380,10 +308,7 @@ def _run_of(path: Path) -> tuple[Path | None, tuple[str, str, int] | None]:
 
 
 def _chosen(
-    run: Path,
-    methods: Sequence[ResolvedMethod],
-    settings: ViewSettings,
-    cell: tuple[str, str, int] | None,
+    run: Path, methods: Sequence[ResolvedMethod], settings: ViewSettings, cell: tuple[str, str, int] | None
 ) -> list[ResolvedMethod]:
     names = [method.spec.name for method in methods]
     asked = (cell[1],) if cell else settings.methods
@@ -405,10 +330,8 @@ def _imported(path: Path, settings: ViewSettings, kept: Path) -> ShownAvatar:
         raise InputError(settings.data, "", "one capture", names, "Name one capture.")
     form = _form(clips[0], MethodNeeds.of(method.spec), stored.heads, kept)
     avatar = stored.load(config.device)
-    source = _source(settings, config)
-    return ShownAvatar(
-        method.spec.name, avatar, clips[0], form, _driving(source, clips[0], method, config, kept)
-    )
+    sources = _driving(_source(settings, config), clips[0], method, config, kept)
+    return ShownAvatar(method.spec.name, avatar, clips[0], form, sources)
 
 
 def _config(data: str, settings: ViewSettings, kept: Path) -> RunConfig:
@@ -447,13 +370,12 @@ def _driving(
 
 def _recordings(shown: Sequence[ShownAvatar]) -> dict[str, Recording]:
     """Sequences by subject and name, those held out last and marked; of subjects that drive every avatar."""
-    found: dict[str, Recording] = {}
+    recordings: dict[str, Recording] = {}
     clips = {avatar.clip.subject: avatar.clip for avatar in shown}
-    own = {*clips} if len(clips) == 1 else set()
     sources = [form.clip for form in shown[0].sources.values()]
-    for clip in [clips[name] for name in own] + sources:
+    for clip in [*(clips.values() if len(clips) == 1 else ()), *sources]:
         for split, mark in (("train", ""), ("novel_view", ""), ("self_reenactment", ", held out")):
             for key in sorted(clip.splits.get(split, ())):
                 name = f"{key.subject}: {key.sequence}{mark}"
-                found.setdefault(name, {}).setdefault(key.timestep, {})[key.camera] = key
-    return found
+                recordings.setdefault(name, {}).setdefault(key.timestep, {})[key.camera] = key
+    return recordings

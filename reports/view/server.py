@@ -74,10 +74,7 @@ SILENCE_S = 60.0
 class LivePoses:
     """The pose of the latest line, for each head model. Of lines that arrive during a conversion, only the last is used.
 
-    Parameters
-    ----------
-    drivers : Mapping[str, Callable[[str], HeadPose]]
-        Convert a line, by the version of the head model.
+    ``drivers`` convert a line, by the version of the head model.
     """
 
     def __init__(self, drivers: Mapping[str, Callable[[str], HeadPose]]):
@@ -127,8 +124,8 @@ class LivePoses:
             except Exception as error:  # the next line may be a good one
                 if text_of(error) != self._said:  # an invalid signal would repeat the message for each line
                     self._said = text_of(error)
-                    known = isinstance(error, HeadbenchError)
-                    log.warning("%s", error if known else f"live signal: {self._said}", exc_info=not known)
+                    named = isinstance(error, HeadbenchError)
+                    log.warning("%s", error if named else f"live signal: {self._said}", exc_info=not named)
                 continue
             for listener in tuple(self._listeners):
                 listener()
@@ -136,10 +133,7 @@ class LivePoses:
 
 @contextmanager
 def with_live_signal(scene: Scene, settings: ViewSettings) -> Iterator[Scene]:
-    """The scene with the live signal of the settings, if any; it ends with the block.
-
-    Raises `InputError` for a port that is taken, and a head model file that cannot be read.
-    """
+    """The scene with the live signal of the settings, if any; it ends with the block."""
     if not settings.live:
         yield scene
         return
@@ -273,9 +267,8 @@ def viser() -> Any:
     try:
         return importlib.import_module("viser")
     except ImportError:
-        raise UnavailableError(
-            "The viewer runs on viser, which is not installed.", install_extra("view")
-        ) from None
+        text = "The viewer runs on viser, which is not installed."
+        raise UnavailableError(text, install_extra("view")) from None
 
 
 def check_port(port: int) -> None:
@@ -285,6 +278,7 @@ def check_port(port: int) -> None:
             trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             trial.bind((LOOPBACK, port))
     except OSError as error:
+        remedy = "Choose another --port."
         raise InputError(
-            "command line", "--port", "a port that is free", f"{port}: {error}", "Choose another --port."
+            "command line", "--port", "a port that is free", f"{port}: {error}", remedy
         ) from None

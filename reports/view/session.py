@@ -114,8 +114,8 @@ def moved(scene: Scene, shown: ShownAvatar, camera: Camera, key: FrameKey | None
     """Convert a camera to an avatar's world; for another subject, relative to its head."""
     motion = np.eye(4)
     motion[:3, 3] = scene.first.center - shown.center
-    there = Camera(camera.id, camera.width, camera.height, camera.K, camera.world_to_camera @ motion)
-    return shown.camera(there, key)
+    translated = Camera(camera.id, camera.width, camera.height, camera.K, camera.world_to_camera @ motion)
+    return shown.camera(translated, key)
 
 
 def splats_of(scene: Scene, shown: ShownAvatar, state: State, view: FreeView) -> SplatArrays | None:
@@ -124,17 +124,17 @@ def splats_of(scene: Scene, shown: ShownAvatar, state: State, view: FreeView) ->
         return None
     key = key_of(scene, state)
     camera = moved(scene, shown, view.camera(LEAST_PX, LEAST_PX), key)
-    found = shown.avatar.splats(pose_of(shown, state, key), camera)
-    if found.colors is None:
+    splats = shown.avatar.splats(pose_of(shown, state, key), camera)
+    if splats.colors is None:
         return None
     # From the method's world into that of the first avatar: the same camera in both.
     back = np.linalg.inv(view.world_to_camera) @ camera.world_to_camera
-    axes = (back[:3, :3] @ rotations(found.quats)) * found.scales[:, None, :]
+    axes = (back[:3, :3] @ rotations(splats.quats)) * splats.scales[:, None, :]
     return SplatArrays(
-        (found.means @ back[:3, :3].T + back[:3, 3]).astype(np.float32),
+        (splats.means @ back[:3, :3].T + back[:3, 3]).astype(np.float32),
         np.asarray(axes @ axes.transpose(0, 2, 1), np.float32),
-        np.clip(found.colors, 0.0, 1.0),
-        found.opacities[:, None],
+        np.clip(splats.colors, 0.0, 1.0),
+        splats.opacities[:, None],
     )
 
 
@@ -189,10 +189,7 @@ p.mantine-Text-root:has(> label) { font-size: 1em !important; letter-spacing: 0 
 class ControlPanel:
     """Controls in the browser of ``client``; ``changed`` is called after each change, ``jumped`` with a camera's name.
 
-    Attributes
-    ----------
-    screenshot, turntable, sequence : button
-        Buttons, whose actions the caller sets.
+    The caller sets the actions of the buttons ``screenshot``, ``turntable`` and ``sequence``.
     """
 
     def __init__(
@@ -210,13 +207,9 @@ class ControlPanel:
         gui.set_panel_label("headbench")
         gui.add_html(LABELS)
         self._legend = gui.add_markdown("")
-        self._mode = self._add(
-            gui.add_dropdown(
-                *("Drawn as", (IMAGES, SPLATS)),
-                initial_value=IMAGES,
-                hint="Images are exact and drawn by the server; splats are drawn by the browser, about 40 dB near.",
-            )
-        )
+        hint = "Images are exact and drawn by the server; splats are drawn by the browser, about 40 dB near."
+        mode = gui.add_dropdown("Drawn as", (IMAGES, SPLATS), initial_value=IMAGES, hint=hint)
+        self._mode = self._add(mode)
         self._background = self._add(gui.add_rgb("Background", initial_value=(255, 255, 255)))
         with gui.add_folder("Recording"):
             names = (*([LIVE] if scene.first.live else []), NEUTRAL, *scene.recordings)
@@ -224,12 +217,9 @@ class ControlPanel:
             self._timestep = self._add(gui.add_slider("Frame", min=0, max=1, step=1, initial_value=0))
             self._playing = self._add(gui.add_checkbox("Play", initial_value=False))
             self._fps = gui.add_slider("Frames per second", min=1, max=MOST_FPS, step=1, initial_value=25)
-            cameras = sorted(scene.first.clip.cameras)
-            self._camera = gui.add_dropdown(
-                *("Camera", (FREE, *cameras)),
-                initial_value=FREE,
-                hint="A camera of the capture shows the captured image next to it, if there is one.",
-            )
+            cameras = FREE, *sorted(scene.first.clip.cameras)
+            hint = "A camera of the capture shows the captured image next to it, if there is one."
+            self._camera = gui.add_dropdown("Camera", cameras, initial_value=FREE, hint=hint)
         self._recording.on_update(lambda _: self._recording_chosen())
         self._camera.on_update(lambda _: jumped("" if self._camera.value == FREE else self._camera.value))
         heads = scene.expressions(expressions)
@@ -384,8 +374,6 @@ class Session:
         self._changed.set()
         self._thread.join(timeout=10.0)
 
-    # -------------------------------------------------------------- the loop
-
     def _run(self) -> None:
         last = time.perf_counter()
         while not self._closed:
@@ -460,11 +448,8 @@ class Session:
                 self._offset = right
                 self._step_back()
             centers = SCALE * (splats.centers + ((number - middle) * APART_M) * self._offset)
-            values = (
-                centers.astype(np.float32),
-                SCALE**2 * splats.covariances,
-                *(splats.colors, splats.opacities),
-            )
+            colors = splats.colors, splats.opacities
+            values = (centers.astype(np.float32), SCALE**2 * splats.covariances, *colors)
             if number in self._handles:
                 self._handles[number].visible = True
                 self._handles[number].set_gaussians(*values)
@@ -479,8 +464,6 @@ class Session:
             start = packed
         self._client.flush()
         self._panel.show_times("; ".join(told))
-
-    # -------------------------------------------------------------- the camera
 
     def _size(self) -> tuple[int, int]:
         """Width and height of the browser's canvas, pixels, at most `MOST_WIDTH` by `MOST_HEIGHT`."""
@@ -529,8 +512,6 @@ class Session:
         if name:
             self._place(self._scene.first.clip.cameras[name])
         self._changed.set()
-
-    # -------------------------------------------------------------- saved files
 
     def _do(self, task: Callable[[], None]) -> None:
         if len(self._tasks) < MOST_TASKS:

@@ -18,7 +18,7 @@ from headbench.reports.runs import RunSet
 from headbench.reports.table_report import table_text
 
 from .made_rows import row
-from .test_layouts import GALLERY
+from .test_table_report import GALLERY
 
 BOTH = {"novel_view": TaskFrames(), "self_reenactment": TaskFrames()}
 

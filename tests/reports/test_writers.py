@@ -9,15 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headbench.reports.writers import (
-    csv_text,
-    escape_latex,
-    to_csv,
-    to_html,
-    to_latex,
-    to_markdown,
-    to_text,
-)
+from headbench.reports.writers import csv_text, escape_latex, to_csv, to_html, to_latex, to_markdown, to_text
 
 from .latex import compile_latex, depth
 from .made_rows import table_of

@@ -2,28 +2,187 @@
 
 import json
 import re
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
+from headbench.bench.condition import PLAIN, Condition
 from headbench.bench.engine.store import RunFolder
+from headbench.bench.manifest import MethodRecord
+from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
+from headbench.bench.rows import Rows
 from headbench.reports.runs import RunSet
+from headbench.reports.statistics.comparisons import PairedComparison
+from headbench.reports.suite import suite as primary
 from headbench.reports.suite.suite import (
     CROSSED,
     ENDPOINTS,
     LARGE,
+    MARGINS,
+    PAIR,
+    PRIMARY,
+    _cell,
+    ablation_table,
     components,
     condition_table,
     drop_table,
     extremes_section,
+    primary_comparisons,
+    primary_section,
     read_extremes,
     suite_report,
     variance_section,
 )
 from headbench.reports.table_report import table_of
 
-PSNR = {
+from ..conftest import LPIPS, PSNR
+from ..made_rows import row
+
+PAGE = Path(__file__).parents[3] / "docs" / "explanation" / "suite.md"
+TASKS = tuple(dict.fromkeys(task for task, _ in PRIMARY))
+
+
+def test_the_documentation_lists_the_same_endpoints():
+    section = PAGE.read_text(encoding="utf-8").split("## Primary endpoints")[1].split("\n## ")[0]
+    assert tuple(re.findall(r"^\| `(\w+)` \| `(\w+)` \|$", section, re.MULTILINE)) == PRIMARY
+    assert "`{}` against `{}`".format(*PAIR) in section
+    assert f"equivalence within {MARGINS['psnr']:g} dB" in section
+    assert [*MARGINS] == ["psnr"]
+
+
+@pytest.fixture
+def runs():
+    """Runs of ten subjects; ours ahead of ga by 0.2 dB, other in each task and metric, a third method far behind."""
+    generator = np.random.default_rng(0)
+    rows = [
+        row(method, metric, level + generator.normal(0, 0.1), f"s{s}", task=task)
+        for method, level in (("ga", 30.0), ("ours", 30.2), ("gbs", 20.0))
+        for task, metric in PRIMARY
+        for s in range(10)
+    ]
+    records = {name: MethodRecord(name, "1", "m:M", False, None, {}) for name in ("ga", "ours", "gbs")}
+    return RunSet((), Rows.of(rows), (PSNR, LPIPS), TASKS, records, (), {}, {})
+
+
+def test_all_endpoints_are_one_family(runs):
+    found = primary_comparisons(runs)
+    assert [(c.task, c.metric) for c in found] == [*PRIMARY]
+    assert {(c.first, c.second, c.family) for c in found} == {(*PAIR, len(PRIMARY))}
+    options = {"permutation_type": "samples", "n_resamples": np.inf, "vectorized": True}
+    values = [[v for _, v in c.differences] for c in found]
+    expected = np.array([stats.permutation_test((v,), np.mean, **options).pvalue for v in values])
+    # Holm's procedure as a sequence of rejections, at the smallest level that rejects each hypothesis.
+    order = expected.argsort()
+    adjusted = {
+        i: max((6 - k) * expected[j] for k, j in enumerate(order[: n + 1])) for n, i in enumerate(order)
+    }
+    assert [c.p_holm for c in found] == pytest.approx([min(1.0, adjusted[i]) for i in range(6)])
+    assert [c.margin for c in found] == [MARGINS.get(metric) for _, metric in PRIMARY]
+    assert [c.equivalent is None for c in found] == [metric not in MARGINS for _, metric in PRIMARY]
+
+
+def test_the_section_shows_each_endpoint_with_its_test(runs):
+    text = primary_section(runs)
+    lines = [line for line in text.splitlines() if line.startswith("|")][2:]
+    assert len(lines) == len(PRIMARY)
+    assert lines[0].startswith("| Novel view, PSNR (dB) | +0.")
+    assert sum("within 0.3 dB" in line for line in lines) == 3
+    assert "exploratory" in text
+
+
+def test_runs_without_the_pair_have_no_primary_endpoint(runs):
+    other = runs.only(["ours", "gbs"])
+    assert primary_comparisons(other) == []
+    assert "primary endpoints compare `ours` with `ga`" in primary_section(other)
+
+
+@pytest.mark.parametrize(("planned", "interim"), [(0, 0), (10, 0), (12, len(PRIMARY))])
+def test_there_is_no_verdict_before_all_subjects_are_measured(runs, monkeypatch, planned, interim):
+    monkeypatch.setattr(primary, "planned_subjects", lambda runs: planned)
+    text = primary_section(runs)
+    assert text.count("interim: 10 of 12 subjects") == interim
+    assert ("is better" in text or "no significant difference" in text) == (not interim)
+
+
+def test_planned_subjects_are_those_of_the_captures():
+    steps = [{"parameters": {"synthetic": {"subjects": 10}}}, {"parameters": {}}]
+    run = SimpleNamespace(manifest=SimpleNamespace(clips=[SimpleNamespace(steps=steps)]))
+    assert primary.planned_subjects(SimpleNamespace(runs=(run, run))) == 10
+    assert primary.planned_subjects(SimpleNamespace(runs=())) == 0
+
+
+def test_rows_are_ablations_and_cells_their_differences(make_run):
+    both = ("toy_plugin:MIRROR", "toy_plugin:METHOD")
+    conditions = (PLAIN, Condition("less", ("toy",), {"level": 0.5}))
+    runs = RunSet.read(
+        [make_run("run", methods=both, settings={"toy": {"level": 0.25}}, conditions=conditions)]
+    )
+    table = ablation_table(runs, "toy", {"toy+less": "less"})
+    (row,) = table.rows
+    assert row.method == "less"
+    plain = {line.method: line for line in table_of(runs).rows}
+    assert "mirror" in plain
+    wanted = [b.value - a.value for a, b in zip(plain["toy"].cells, plain["toy+less"].cells)]
+    assert [cell.value for cell in row.cells] == pytest.approx(wanted)
+    assert any(wanted)
+    assert [float(cell.text.split()[0]) for cell in row.cells] == pytest.approx(wanted, abs=1e-3)
+
+
+def test_crossed_cells_are_differences_between_the_tasks(make_run):
+    conditions = (PLAIN, Condition("less", ("toy",), {"level": 0.5}))
+    runs = RunSet.read([make_run("run", settings={"toy": {"level": 0.25}}, conditions=conditions)])
+    names = {"toy+less": "less"}
+    plain, crossed = (ablation_table(runs, "toy", names, crossed=each) for each in (False, True))
+    (cells,), (found,) = ([row.cells for row in table.rows] for table in (plain, crossed))
+    by_task = {c.task: cell.value for c, cell in zip(plain.columns, cells) if c.task}
+    views = by_task.pop("novel_view")
+    assert [column.task for column in crossed.columns] == [SEEN_CAMERAS, UNSEEN_CAMERAS]
+    expected = [views - value for value in by_task.values()]
+    assert [cell.value for cell in found] == pytest.approx(expected, abs=1e-9)
+    assert any(abs(value) > 0 for value in expected)
+    assert crossed.columns[0].title == "Novel view minus self-reenactment at seen cameras"
+    assert "the same difference in self-reenactment" in crossed.caption
+
+
+def test_speeds_of_different_runs_are_not_compared(write_run):
+    runs = RunSet.read([write_run("run", {"ours": 30.0, "ours+less": 29.0})])
+    table = ablation_table(runs, "ours", {"ours+less": "less"})
+    assert "fps" in {column.metric for column in table_of(runs).columns}
+    assert "fps" not in {column.metric for column in table.columns}
+    assert [cell.value for cell in table.rows[0].cells] == pytest.approx(
+        [{"psnr": -1.0, "ssim": -0.025, "lpips": 0.001, "storage": -0.1}[c.metric] for c in table.columns]
+    )
+    assert "Speed" not in table.caption
+
+
+def test_coded_avatars_that_ablations_do_not_have_get_no_column(write_run):
+    folder = RunFolder(write_run("run", {"ours": 30.0, "ours+less": 29.0}))
+    rows = pd.read_parquet(folder.rows)
+    rows[~((rows.condition == "less") & (rows.metric == "storage"))].to_parquet(folder.rows)
+    table = ablation_table(RunSet.read([folder.root]), "ours", {"ours+less": "less"})
+    assert {column.metric for column in table.columns} == {"psnr", "ssim", "lpips"}
+    assert len(table.rows[0].cells) == len(table.columns)
+
+
+@pytest.mark.parametrize(
+    ("found", "text", "rank"),
+    [
+        ({"difference": -0.25, "low": -0.3, "high": -0.2, "p_holm": 0.02}, "-0.250 (-0.300, -0.200)", 1),
+        ({"difference": 0.25, "low": -0.1, "high": 0.4, "p_holm": 0.2}, "+0.250 (-0.100, +0.400)", None),
+        ({"difference": 0.25, "p_holm": 1.0}, "+0.250", None),
+        ({"reason": "failed on 1 subject"}, "failed on 1 subject", None),
+    ],
+)
+def test_a_cell_has_difference_interval_and_mark(found, text, rank):
+    cell = _cell(PairedComparison("novel_view", "psnr", True, "less", "whole", **found), 2)
+    assert (cell.text, cell.rank) == (text, rank)
+
+
+VALUES = {
     "mean-image": 20.0,
     "ga": 30.0,
     "ours": 31.0,
@@ -38,7 +197,7 @@ DROP = {"ga": 1.5, "ours": 1.0, "ga+tracked": 0.25, "ours+tracked": -0.5}
 @pytest.fixture
 def tracked_run(write_run):
     """A suite's run whose self-reenactment is worse than its novel views by `DROP`."""
-    folder = RunFolder(write_run("suite/run", PSNR))
+    folder = RunFolder(write_run("suite/run", VALUES))
     rows = pd.read_parquet(folder.rows)
     for label, drop in DROP.items():
         name, _, condition = label.partition("+")
@@ -56,7 +215,7 @@ def test_the_drop_is_novel_view_minus_self_reenactment(tracked_run):
     table = drop_table(of_tracked(tracked_run))
     assert {row.method: row.cells[-1].value for row in table.rows} == pytest.approx(DROP)
     assert {row.method: float(row.cells[-1].text) for row in table.rows} == pytest.approx(DROP, abs=1e-4)
-    assert {row.method: row.cells[0].value for row in table.rows} == {name: PSNR[name] for name in DROP}
+    assert {row.method: row.cells[0].value for row in table.rows} == {name: VALUES[name] for name in DROP}
 
 
 def test_a_drop_is_missing_where_a_task_has_no_values(tracked_run):
@@ -72,10 +231,10 @@ def test_rows_are_methods_and_cells_tracked_minus_plain(tracked_run):
     table = condition_table(runs, TRACKED, "Tracked from images")
     plain = {row.method: row.cells for row in table_of(runs).rows}
     assert [row.method for row in table.rows] == [*TRACKED]
-    for row in table.rows:
-        wanted = [b.value - a.value for a, b in zip(plain[row.method], plain[TRACKED[row.method]])]
+    for line in table.rows:
+        wanted = [b.value - a.value for a, b in zip(plain[line.method], plain[TRACKED[line.method]])]
         kept = [i for i, column in enumerate(table_of(runs).columns) if column.metric != "fps"]
-        assert [cell.value for cell in row.cells] == pytest.approx([wanted[i] for i in kept])
+        assert [cell.value for cell in line.cells] == pytest.approx([wanted[i] for i in kept])
 
 
 def test_tracking_from_images_is_no_ablation(tracked_run):
