@@ -28,11 +28,11 @@ def code_digest(reference: str) -> str:
     folder, files = Path(source).parent, Path(source).parent.glob("*.py")
     while is_outside(reference) and (folder / "__init__.py").is_file():
         files, folder = folder.rglob("*.py"), folder.parent
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for path in sorted(files):
         content = path.read_bytes()
-        found.update(f"{path.relative_to(folder).as_posix()} {len(content)}\n".encode() + content)
-    return found.hexdigest()[:12]
+        digest.update(f"{path.relative_to(folder).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()[:12]
 
 
 def forget_code() -> None:
