@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 class MethodRecord:
     """Record of a method under a condition; see `ResolvedMethod.record`.
 
-    ``needs`` are those not met by the clip itself. ``code`` is the digest of its code, see `bench.source`; None for a folder of
+    ``needs`` are those not met by the clip itself. ``code`` is the digest of its code, see `registry.code_digest`; None for a folder of
     images, which has none. ``codec`` is that of the measured avatars (`CodedAvatar`), "" for files as trained, several
     separated by semicolons; None before an avatar is measured, and in runs that did not record it.
     """

@@ -7,13 +7,14 @@ implementation as ``"package.module:attribute"``. That of a command names its fu
 from __future__ import annotations
 
 import difflib
+import hashlib
 import importlib
 import json
 import logging
 import os
 import sys
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib import metadata
 from importlib.metadata import Distribution, EntryPoint
 from pathlib import Path
@@ -192,3 +193,29 @@ def _checked(value: Any, group: str, name: str) -> Any:
         expected = "a function with @command" if group == "commands" else f"a {SPEC_TYPES[group].__name__}"
         raise InputError(f"registry of {group}", name, expected, f"a {type(spec).__name__}")
     return spec
+
+
+@cache
+def code_digest(reference: str) -> str:
+    """First 12 hex digits of a SHA-256 over the Python files in the folder of ``"package.module:Object"``; "" without files.
+
+    For a module of a package outside this one, all files below the package are included. The result is cached,
+    see `forget_code`.
+    """
+    resolve(reference)  # imports the module
+    source = getattr(sys.modules[reference.partition(":")[0]], "__file__", None)
+    if source is None:
+        return ""
+    folder, files = Path(source).parent, Path(source).parent.glob("*.py")
+    while is_outside(reference) and (folder / "__init__.py").is_file():
+        files, folder = folder.rglob("*.py"), folder.parent
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(folder).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()[:12]
+
+
+def forget_code() -> None:
+    """Clear the cache of `code_digest`, since files may have changed."""
+    code_digest.cache_clear()

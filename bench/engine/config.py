@@ -19,8 +19,7 @@ from ..configuration import build, build_arguments, deciding_settings, merge, se
 from ..contracts import Budget, TaskName
 from ..errors import InputError
 from ..io.files import check_name, check_utf8
-from ..registry import discover, get, is_outside, resolve, unknown
-from ..source import code_digest, forget_code
+from ..registry import code_digest, discover, forget_code, get, is_outside, resolve, unknown
 from ..specs import ConditionSpec, MethodSpec, MetricSpec, ProfileSpec
 
 CANONICAL = "canonical"
