@@ -36,8 +36,8 @@ COLUMNS = ("task", "sequence", "timestep", "camera", "region", "metric", "value"
 
 def list_methods() -> dict[str, MethodSpec]:
     """The registered methods by name, in the order of tables; plug-ins that cannot be loaded are left out."""
-    found = {name: plugin.spec for name, plugin in discover("methods").items()}
-    return {name: spec for name, spec in found.items() if spec is not None}
+    specs = {name: plugin.spec for name, plugin in discover("methods").items()}
+    return {name: spec for name, spec in specs.items() if spec is not None}
 
 
 def open_clip(

@@ -273,12 +273,12 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
 
 def _all_commands(plugins: Mapping[str, Plugin]) -> Command:
     """All commands as nested subcommands, for completion. Commands that cannot be loaded are left out."""
-    found: dict[str, dict[str, Command]] = {}
+    groups: dict[str, dict[str, Command]] = {}
     for name, plugin in sorted(plugins.items()):
         first, _, second = name.partition(" ")
         with suppress(HeadbenchError):
-            found.setdefault(first, {})[second] = _command(name, plugin, ())
-    return _nested({first: _nested(seconds) for first, seconds in found.items()})
+            groups.setdefault(first, {})[second] = _command(name, plugin, ())
+    return _nested({first: _nested(seconds) for first, seconds in groups.items()})
 
 
 def _nested(group: Mapping[str, Command]) -> Command:
@@ -286,18 +286,18 @@ def _nested(group: Mapping[str, Command]) -> Command:
     import tyro
 
     # Not tyro's function for subcommands: it searches typing's sources for help, which doubles the time.
-    own = group.get("")
+    command_of_level = group.get("")
     words = {name: command for name, command in group.items() if name}
-    if own is not None and not words:
-        return own
+    if command_of_level is not None and not words:
+        return command_of_level
     choices = [Annotated[Any, tyro.conf.subcommand(name=n, constructor=c)] for n, c in words.items()]
     choice: Any = Union[(*choices, Annotated[None, tyro.conf.Suppress])]
 
     def chosen(command: choice) -> Callable[[], int]:
         return command
 
-    if own is not None:
-        chosen.__annotations__ = {"command": choice, "settings": own.__annotations__["settings"]}
+    if command_of_level is not None:
+        chosen.__annotations__ = {"command": choice, "settings": command_of_level.__annotations__["settings"]}
         chosen.__signature__ = inspect.signature(lambda command, settings: None)  # type: ignore[attr-defined]
     return chosen
 

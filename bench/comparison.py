@@ -246,9 +246,9 @@ def _configuration_of(run: Path, values: Mapping[str, Any], settings: RunSetting
     config = run_configuration(run, RunOptions(data=settings.data, head=settings.head), used, given)
     started = programs(config.methods) if "methods" in used else ()
     check_trusted(run, {"metric_profiles": config.metric_profiles, PROGRAMS: started}, given, trust=False)
-    own = {**asdict(config), "source": str(run)}
-    del own["out"]
-    return own
+    configuration = {**asdict(config), "source": str(run)}
+    del configuration["out"]
+    return configuration
 
 
 def _result(run: FinishedRun) -> CommandResult:

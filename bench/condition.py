@@ -25,8 +25,8 @@ def label_of(method: str, condition: str) -> str:
 def part_of_text(text: str, name: str) -> Fraction:
     """Parse a fraction in (0, 1]. Raises `ValueError` for any other text."""
     # Bounded, since `Fraction` needs hours for a long exponent. The reduced form of a fraction is accepted, too.
-    known = re.fullmatch(r"\d{1,6}(\.\d{1,12})?(/\d{1,6})?|\d{1,18}/\d{1,18}", text)
-    parts = text.split("/") if known else ["0"]
+    match = re.fullmatch(r"\d{1,6}(\.\d{1,12})?(/\d{1,6})?|\d{1,18}/\d{1,18}", text)
+    parts = text.split("/") if match else ["0"]
     value = Fraction(parts[0]) / (int(parts[1]) if len(parts) > 1 and int(parts[1]) else 1)
     if not 0 < value <= 1 or (len(parts) > 1 and not int(parts[1])):
         raise ValueError(f"{name} is {text[:40]!r}; a part above 0 and at most 1, such as 1/4 or 0.25")
@@ -35,10 +35,10 @@ def part_of_text(text: str, name: str) -> Fraction:
 
 def seconds_of_text(text: str) -> float | None:
     """Parse a training time such as "30 s"; None for other text. Raises `ValueError` for 0 s."""
-    found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,6})?) s", text)
-    if found and not float(found[1]):
+    match = re.fullmatch(r"(\d{1,6}(?:\.\d{1,6})?) s", text)
+    if match and not float(match[1]):
         raise ValueError(f"budget is {text!r}; more than 0 s")
-    return float(found[1]) if found else None
+    return float(match[1]) if match else None
 
 
 @dataclass(frozen=True)

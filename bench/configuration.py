@@ -90,12 +90,12 @@ def build_file(cls: type[T], path: Path) -> T:
 
 def setting_paths(cls: Any, prefix: str = "") -> list[str]:
     """Dotted path of every setting of a dataclass, groups before their members."""
-    hints, found = get_type_hints(cls), []
+    hints, paths = get_type_hints(cls), []
     for field in dataclasses.fields(cls):
-        found.append(f"{prefix}{field.name}")
+        paths.append(f"{prefix}{field.name}")
         if dataclasses.is_dataclass(hints[field.name]):
-            found += setting_paths(hints[field.name], f"{prefix}{field.name}.")
-    return found
+            paths += setting_paths(hints[field.name], f"{prefix}{field.name}.")
+    return paths
 
 
 def deciding_settings(config: Any) -> Any:

@@ -167,23 +167,23 @@ def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
     from .machine import machine_record
     from .registry import discover, get, unknown
 
-    own = parse_assignments(settings.set)
-    stray = set(own) - {"settings"}
+    assigned = parse_assignments(settings.set)
+    stray = set(assigned) - {"settings"}
     if stray:
         raise unknown("command line", "--set", min(stray), ["settings"])
-    chosen: Mapping[str, Mapping[str, Any]] = own.get("settings", {})
+    chosen: Mapping[str, Mapping[str, Any]] = assigned.get("settings", {})
     RunConfig("", "", device=settings.device)  # refuses invalid devices
     named = {get("methods", name).name: name for name in settings.methods}
-    known = [*named] if named else [*discover("methods")]
+    names = [*named] if named else [*discover("methods")]
     programs = {} if named else _programs()
-    if unfit := sorted(set(chosen) - {*known, *programs}):
-        raise unknown("command line", "--set settings", unfit[0], [*known, *programs])
+    if unfit := sorted(set(chosen) - {*names, *programs}):
+        raise unknown("command line", "--set settings", unfit[0], [*names, *programs])
     if not all(isinstance(values, Mapping) for values in chosen.values()):
         raise InputError("command line", "--set settings", "settings.METHOD.KEY=VALUE", "another")
     statuses = [PluginStatus("machine", settings.device, True, tuple(_device(settings.device)))]
-    for name in known:
+    for name in names:
         statuses.append(_method(named.get(name, name), name in named, not named, settings.device, chosen))
-        progress(len(statuses), len(known) + 1, name)
+        progress(len(statuses), len(names) + 1, name)
     for group in ("metrics", "datasets") if not named else ():
         for name, plugin in discover(group).items():  # type: ignore[arg-type]
             if plugin.spec is None:
@@ -250,10 +250,10 @@ def _slurm() -> Iterator[Need]:
     from importlib.metadata import PackageNotFoundError, version
 
     try:
-        found = version("submitit")
+        installed = version("submitit")
     except PackageNotFoundError:
-        found = ""
-    yield Need("submitit", found, install_extra("slurm"))
+        installed = ""
+    yield Need("submitit", installed, install_extra("slurm"))
     remedy = "Commands of the cluster; without one, `--executor processes` uses the cores of this machine."
     yield Need("sbatch", shutil.which("sbatch") or "", remedy)
 
@@ -311,8 +311,8 @@ def _lines(statuses: list[PluginStatus]) -> Iterator[str]:
         if status.group != group:
             group = status.group
             yield f"\n{group}"
-        there = "; ".join(f"{need.what}: {need.found}" for need in status.needs if need.found)
-        yield f"  {status.name:<{width}}{status.state:<9}{there}".rstrip()
+        present = "; ".join(f"{need.what}: {need.found}" for need in status.needs if need.found)
+        yield f"  {status.name:<{width}}{status.state:<9}{present}".rstrip()
         for need in status.missing:
             effect = "" if need.required else " (works without)"
             yield f"    no {need.what}{effect}. {need.remedy}".rstrip()

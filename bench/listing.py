@@ -56,8 +56,8 @@ def list_installed(settings: ListSettings, progress: Progress) -> CommandResult:
     group: Group = "methods" if settings.what == "presets" else settings.what
     entries: list[dict[str, Any]] = []
     for name, plugin in discover(group).items():
-        known = {} if plugin.spec is None else asdict(plugin.spec)
-        entries.append({"origin": plugin.origin, "error": plugin.error, **known, "name": name})
+        spec_fields = {} if plugin.spec is None else asdict(plugin.spec)
+        entries.append({"origin": plugin.origin, "error": plugin.error, **spec_fields, "name": name})
     if settings.what == "presets":
         entries = [
             {

@@ -61,11 +61,11 @@ def _allowed_cores() -> int:
 def _cgroup_limits(controller: str, *names: str) -> Iterator[list[str]]:
     """Words of the files ``names`` of every cgroup of this process that limits a controller; of versions 1 and 2."""
     lines = OWN_CGROUPS.read_text(encoding="utf-8").splitlines() if OWN_CGROUPS.exists() else []
-    for _, controllers, own in (line.split(":", 2) for line in lines):
+    for _, controllers, group in (line.split(":", 2) for line in lines):
         if controllers and controller not in controllers.split(","):
             continue
         # In a container the path may be that outside, which does not exist here.
-        place = (CGROUPS / controller if controllers else CGROUPS) / own.lstrip("/")
+        place = (CGROUPS / controller if controllers else CGROUPS) / group.lstrip("/")
         for folder in (place, *place.parents):
             files = [folder / name for name in names]
             words = [word for file in files if file.is_file() for word in file.read_text("ascii").split()]
@@ -101,8 +101,8 @@ def _commit_record(folder: Path) -> dict[str, str]:
     command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     with suppress(OSError, subprocess.SubprocessError):
         if (folder / ".git").exists():
-            found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=20)
-            return {"commit": found.stdout.strip()}
+            described = subprocess.run(command, capture_output=True, text=True, check=True, timeout=20)
+            return {"commit": described.stdout.strip()}
     return {}
 
 
@@ -113,13 +113,13 @@ def _device_record(device: str) -> dict[str, Any]:
         return {}
     use_device(device)
     properties = resolve("torch:cuda").get_device_properties(device)
-    found = {
+    record = {
         "name": properties.name,
         "memory_bytes": properties.total_memory,
         "capability": f"{properties.major}.{properties.minor}",
         "cuda": resolve("torch:version").cuda,
     }
-    return {"device": found}
+    return {"device": record}
 
 
 def use_device(device: str) -> None:
@@ -276,17 +276,17 @@ class ProcessorLoad:
         if self._wait and kind is None:
             time.sleep(max(0.0, self._start + SHORTEST_LOAD_S - time.perf_counter()))
         # Own time is read outside of the total, so that work between the two calls is not attributed to others.
-        busy, own = _busy_seconds(), _own_processor_seconds()
+        busy, of_process = _busy_seconds(), _own_processor_seconds()
         seconds = time.perf_counter() - self._start
         if seconds >= SHORTEST_LOAD_S and self._busy is not None and busy is not None:
-            others = busy - self._busy - (own - self._own)
+            others = busy - self._busy - (of_process - self._own)
             self.other_cores = round(min(max(0.0, others / seconds), self.cores), 3)
 
     @property
     def details(self) -> dict[str, float]:
         """The numbers for a `Measurement`; without `other_cores` if that is unknown."""
-        known = {} if self.other_cores is None else {"other_cores": self.other_cores}
-        return {"threads": self.threads, "cores": self.cores, **known}
+        others = {} if self.other_cores is None else {"other_cores": self.other_cores}
+        return {"threads": self.threads, "cores": self.cores, **others}
 
 
 def machine_name(device: str = "cpu") -> str:
@@ -328,8 +328,8 @@ def _busy_seconds() -> float | None:
 
 def peak_memory_bytes() -> int:
     """Return the peak resident memory so far of this process or of any single finished child."""
-    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * RUSAGE_UNIT
-    return max(own, _children_peak())
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * RUSAGE_UNIT
+    return max(peak, _children_peak())
 
 
 def processor_seconds() -> float:

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 class MethodRecord:
     """Record of a method under a condition; see `ResolvedMethod.record`.
 
-    ``needs`` are those not met by the clip itself. ``code`` is the digest of its code, see `bench.source`; None for a folder of
+    ``needs`` are those not met by the clip itself. ``code`` is the digest of its code, see `registry.code_digest`; None for a folder of
     images, which has none. ``codec`` is that of the measured avatars (`CodedAvatar`), "" for files as trained, several
     separated by semicolons; None before an avatar is measured, and in runs that did not record it.
     """
@@ -103,8 +103,8 @@ class ProtocolRecord:
     @classmethod
     def of(cls, protocol: Protocol) -> ProtocolRecord:
         """Record a protocol."""
-        own = {f.name: getattr(protocol, f.name) for f in fields(protocol)}
-        return cls(protocol.id, protocol.hash, **own)
+        values = {f.name: getattr(protocol, f.name) for f in fields(protocol)}
+        return cls(protocol.id, protocol.hash, **values)
 
     def protocol(self, source: Path) -> Protocol:
         """The protocol recorded in the file ``source``."""
@@ -239,8 +239,8 @@ class Manifest:
         for protocol in self.protocols.values():
             file = protocol_path(path.parent, protocol.hash)
             write_text(file, json.dumps(asdict(protocol), separators=(",", ":")) + "\n")
-        own = replace(self, protocols={})
-        record = {name: value for name, value in asdict(own).items() if value is not None}
+        without = replace(self, protocols={})
+        record = {name: value for name, value in asdict(without).items() if value is not None}
         record[PROTOCOLS] = {task: protocol.hash for task, protocol in self.protocols.items()}
         for method in record["methods"]:
             for name in ("needs", "code", "condition"):
@@ -267,15 +267,15 @@ class Manifest:
         lie is no difference: the fingerprints of the captures tell. Changed code of a method of this package is a warning.
         """
         settings, results = zip(*(each._compared for each in (earlier, self)))
-        found = [*differences(*settings)]
-        if not found:
-            found = [*differences(*results)]
+        changes = [*differences(*settings)]
+        if not changes:
+            changes = [*differences(*results)]
             for record in earlier.methods:
-                if own := methods.get(record.label):  # "methods" names a label that is missing
-                    found += identity_differences(vars(record), own, f"methods.{record.label}")
-        if found:
-            keys, before, wanted = ([each[place] for each in found[:3]] for place in range(3))
-            more = f" and {counted(len(found) - 3, 'other difference')}" if found[3:] else ""
+                if current := methods.get(record.label):  # "methods" names a label that is missing
+                    changes += identity_differences(vars(record), current, f"methods.{record.label}")
+        if changes:
+            keys, before, wanted = ([each[place] for each in changes[:3]] for place in range(3))
+            more = f" and {counted(len(changes) - 3, 'other difference')}" if changes[3:] else ""
             expected = f"{'; '.join(before)}, as in this run"
             raise InputError(path, ", ".join(keys) + more, expected, "; ".join(wanted), UNCHANGED)
         codes = {method.label: method.code for method in self.methods}

@@ -335,11 +335,11 @@ class RunProgress:
         ahead = [(name, self._cells[cell][name]) for name in later]
         ahead += [part for name in self._names[index + 1 :] for part in self._cells[name].items()]
         parts = [left, *(self._mean(*part) for part in ahead)]
-        known = [part for part in parts if part is not None]
-        bound = "" if len(known) == len(parts) else "more than "
+        estimates = [part for part in parts if part is not None]
+        bound = "" if len(estimates) == len(parts) else "more than "
         count = "" if at is None else f" {at[0]} of {at[1]}"
         place = f"avatar {index + 1} of {len(self._names)}"
-        total = sum(known) if known else None
+        total = sum(estimates) if estimates else None
         text = _text(f"{place} ({cell}): {step}{count}", total, note, bound)
         # All steps of a cell have the same weight, which is sufficient for a bar.
         share = at[0] / at[1] if at is not None and at[1] else 0.0

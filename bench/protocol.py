@@ -108,15 +108,15 @@ def needed(names: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
         wanted["tasks"] += protocol.tasks
         wanted["metric_profiles"].append(protocol.profile)
         wanted["regions"] += [] if protocol.region == "full" else ["face", protocol.region]
-    found: dict[str, Any] = {}
+    values_needed: dict[str, Any] = {}
     for key, values in wanted.items():
         given = settings.get(key)
         if given is None:
-            found |= {key: tuple(dict.fromkeys(values))} if values else {}
+            values_needed |= {key: tuple(dict.fromkeys(values))} if values else {}
         elif lacking := {*values} - {*given} - {"canonical", "face"}:
             expected = f"{', '.join(sorted(lacking))}, by protocol {' or '.join(names)}"
             raise InputError("settings", key, expected, ", ".join(given))
-    return found
+    return values_needed
 
 
 def check_capture(names: Sequence[str], clip: Clip) -> None:

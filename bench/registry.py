@@ -7,13 +7,14 @@ implementation as ``"package.module:attribute"``. That of a command names its fu
 from __future__ import annotations
 
 import difflib
+import hashlib
 import importlib
 import json
 import logging
 import os
 import sys
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib import metadata
 from importlib.metadata import Distribution, EntryPoint
 from pathlib import Path
@@ -65,14 +66,14 @@ def discover(group: Group) -> dict[str, Plugin]:
 
     If two distributions register the same name, headbench's takes precedence and the conflict is logged.
     """
-    found: dict[str, Plugin] = {}
+    plugins: dict[str, Plugin] = {}
     for entry in sorted(entry_points(group=f"headbench.{group}"), key=lambda e: _origin(e) != _OWN):
-        plugin, known = _load(entry, group), found.get(entry.name)
-        if known is None:
-            found[entry.name] = plugin
-        elif known.origin != plugin.origin:
-            log.warning("%s %r of %s is hidden by that of %s", group, entry.name, plugin.origin, known.origin)
-    return found
+        plugin, first = _load(entry, group), plugins.get(entry.name)
+        if first is None:
+            plugins[entry.name] = plugin
+        elif first.origin != plugin.origin:
+            log.warning("%s %r of %s is hidden by that of %s", group, entry.name, plugin.origin, first.origin)
+    return plugins
 
 
 def get(group: Group, name: str) -> Any:
@@ -80,11 +81,11 @@ def get(group: Group, name: str) -> Any:
     if ":" in name:
         return _checked(resolve(name), group, name)
     entries = entry_points(group=f"headbench.{group}")
-    found = sorted((entry for entry in entries if entry.name == name), key=lambda e: _origin(e) != _OWN)
-    if not found:
+    named = sorted((entry for entry in entries if entry.name == name), key=lambda e: _origin(e) != _OWN)
+    if not named:
         hint = "A plug-in is known when its package is installed here."
         raise unknown(f"registry of {group}", "name", name, {entry.name for entry in entries}, hint)
-    plugin = _load(found[0], group)
+    plugin = _load(named[0], group)
     if plugin.spec is None:
         raise HeadbenchError(f"{group[:-1]} {name!r} of {plugin.origin} is broken: {plugin.error}")
     return plugin.spec
@@ -100,8 +101,8 @@ def resolve(reference: str) -> Any:
     module_name, _, attribute = reference.partition(":")
     try:
         value: Any = importlib.import_module(module_name)
-        for part in attribute.split("."):
-            value = getattr(value, part)
+        for name in attribute.split("."):
+            value = getattr(value, name)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
         where = " It is looked for on PYTHONPATH." if isinstance(error, ModuleNotFoundError) else ""
         raise HeadbenchError(f"{reference}: cannot be imported: {error}.{where}") from error
@@ -166,8 +167,8 @@ def _load(entry: EntryPoint, group: str) -> Plugin:
     version = f" {_name_and_version(entry.dist)[1]}" if entry.dist is not None else ""
     origin = f"{_origin(entry)}{version}"
     try:
-        own = _index().get(entry.value) if group == "commands" else None
-        return Plugin(entry.name, origin, own or _checked(entry.load(), group, entry.name))
+        indexed = _index().get(entry.value) if group == "commands" else None
+        return Plugin(entry.name, origin, indexed or _checked(entry.load(), group, entry.name))
     except Exception as error:  # noqa: BLE001 - a plug-in may fail in any way; the others must still load
         return Plugin(entry.name, origin, None, f"{type(error).__name__}: {error}")
 
@@ -181,8 +182,8 @@ def _index() -> dict[str, CommandSpec]:
 
 def index_text() -> str:
     """What `INDEX` should contain: the specs of the functions that headbench's entry points name."""
-    own = [entry for entry in entry_points("headbench.commands") if _origin(entry) == _OWN]
-    specs = [asdict(entry.load().spec) for entry in sorted(own, key=lambda entry: entry.name)]
+    entries = [entry for entry in entry_points("headbench.commands") if _origin(entry) == _OWN]
+    specs = [asdict(entry.load().spec) for entry in sorted(entries, key=lambda entry: entry.name)]
     return "[\n" + ",\n".join(map(json.dumps, specs)) + "\n]\n"
 
 
@@ -192,3 +193,29 @@ def _checked(value: Any, group: str, name: str) -> Any:
         expected = "a function with @command" if group == "commands" else f"a {SPEC_TYPES[group].__name__}"
         raise InputError(f"registry of {group}", name, expected, f"a {type(spec).__name__}")
     return spec
+
+
+@cache
+def code_digest(reference: str) -> str:
+    """First 12 hex digits of a SHA-256 over the Python files in the folder of ``"package.module:Object"``; "" without files.
+
+    For a module of a package outside this one, all files below the package are included. The result is cached,
+    see `forget_code`.
+    """
+    resolve(reference)  # imports the module
+    source = getattr(sys.modules[reference.partition(":")[0]], "__file__", None)
+    if source is None:
+        return ""
+    folder, files = Path(source).parent, Path(source).parent.glob("*.py")
+    while is_outside(reference) and (folder / "__init__.py").is_file():
+        files, folder = folder.rglob("*.py"), folder.parent
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(folder).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()[:12]
+
+
+def forget_code() -> None:
+    """Clear the cache of `code_digest`, since files may have changed."""
+    code_digest.cache_clear()

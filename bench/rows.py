@@ -214,8 +214,8 @@ class Rows:
 
     def seeds(self, method: str | All) -> set[int]:
         """Seeds of a method."""
-        known = self._seeds
-        return set().union(*known.values()) if method is ALL else set(known.get(str(method), ()))
+        seeds = self._seeds
+        return set().union(*seeds.values()) if method is ALL else set(seeds.get(str(method), ()))
 
     @cached_property
     def _seeds(self) -> dict[str, set[int]]:
@@ -238,7 +238,7 @@ class Rows:
     def _frames(self) -> dict[tuple[str, str], list[tuple[str, str, int, str]]]:
         table = self._table[self._table["timestep"] >= 0]
         groups = table[["task", "region", *FRAME]].drop_duplicates().groupby(["task", "region"])[FRAME]
-        return {place: list(own.itertuples(index=False, name=None)) for place, own in groups}  # type: ignore[misc]
+        return {place: list(group.itertuples(index=False, name=None)) for place, group in groups}  # type: ignore[misc]
 
     def renamed(self, labels: Mapping[str, str]) -> Rows:
         """Return the rows with methods renamed."""
@@ -333,9 +333,9 @@ class Rows:
         table = self._table
         kept = table["task"] == ""
         for task, frames in tasks.items():
-            own = table["task"] == task
+            of_task = table["task"] == task
             inside = pd.MultiIndex.from_frame(table[FRAME]).isin(list(frames))
-            kept |= own & (inside | (table["timestep"] < 0))
+            kept |= of_task & (inside | (table["timestep"] < 0))
         return Rows(table[kept])
 
     def as_one_sequence(self) -> Rows:
@@ -344,13 +344,13 @@ class Rows:
         Timesteps are numbered from 0, sorted by sequence and timestep.
         """
         table = self._table
-        own = (table["task"] != "") & (table["timestep"] >= 0)
-        place = table.loc[own].groupby(["task", "subject"])[["sequence", "timestep"]]
+        of_frames = (table["task"] != "") & (table["timestep"] >= 0)
+        place = table.loc[of_frames].groupby(["task", "subject"])[["sequence", "timestep"]]
         numbers = pd.Series(table["timestep"], copy=True)
         for _, group in place:
             order = pd.MultiIndex.from_frame(group)
             numbers[group.index] = order.unique().sort_values().get_indexer(order)
-        sequence = table["sequence"].mask(own, "").astype("str")
+        sequence = table["sequence"].mask(of_frames, "").astype("str")
         return Rows(table.assign(sequence=sequence, timestep=numbers))
 
     def pooled(self, count: int, decibels: Collection[str]) -> Rows:
@@ -361,10 +361,10 @@ class Rows:
         Batches are formed per method, seed, task, subject and metric; rows without a value are unchanged.
         """
         table = self._table
-        own = table[(table["task"] != "") & (table["timestep"] >= 0) & (table["status"] == "ok")]
+        frames = table[(table["task"] != "") & (table["timestep"] >= 0) & (table["status"] == "ok")]
         values = table["value"].copy()
         groups = ["method", "condition", "seed", "task", "subject", "metric", "region"]
-        for key, group in own.sort_values(FRAME).groupby(groups, sort=False):
+        for key, group in frames.sort_values(FRAME).groupby(groups, sort=False):
             numbers = group["value"].to_numpy()
             error = key[5] in decibels  # type: ignore[index]
             batch = np.arange(len(numbers)) // count
@@ -409,8 +409,8 @@ class Rows:
 
 def _mapped(words: pd.Series[str], change: Callable[[str], str]) -> pd.Series[str]:
     """Apply ``change`` to every word, once for each distinct word."""
-    place, known = pd.factorize(words)
-    changed = np.array([change(str(word)) for word in known], dtype=object)[place]
+    place, unique = pd.factorize(words)
+    changed = np.array([change(str(word)) for word in unique], dtype=object)[place]
     return pd.Series(changed, words.index, dtype="str")
 
 

@@ -23,13 +23,13 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 def main() -> int:
     """Run the command line; returns the exit code. Signals that the caller ignores (``nohup``) stay ignored."""
-    own = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
-    for number in own:
+    handled = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    for number in handled:
         signal.signal(number, _interrupt)
     from .cli import main as run  # takes seconds, so import after the handlers are set
 
     code = run()
-    for number in own:
+    for number in handled:
         signal.signal(number, lambda *signalled: os._exit(code))  # everything is done and printed
     return code
 

@@ -117,12 +117,12 @@ def table(
             parts.append([*range(names)])
         parts[-1].append(i)
     texts: list[str] = []
-    for part in parts:
+    for columns_of_part in parts:
         grid = Table(box=ruled, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-        for i in part:
+        for i in columns_of_part:
             fixed = sizes[i] if i < names or i in numbers else None
             grid.add_column(Text(columns[i][0]), width=fixed, overflow="fold")
-        rows = zip(*(columns[i][1:] for i in part), strict=True)
+        rows = zip(*(columns[i][1:] for i in columns_of_part), strict=True)
         for line in lines:
             if len(line) == 1:
                 grid.add_section()

@@ -162,13 +162,13 @@ def check_background(clip: Clip, renders: Mapping[FrameKey, Render]) -> None:
     wrong = [(key, colour) for key, colour in judged if np.abs(colour - declared).max() > TOLERANCE]
     if 2 * len(wrong) <= len(judged):
         return
-    found = np.median([colour for _, colour in wrong], axis=0)
+    colours = np.median([colour for _, colour in wrong], axis=0)
     expected = f"the background of the capture, {_rgb(declared)}, where the ground truth shows it"
     raise InputError(
         renders[wrong[0][0]].image,
         "background",
         expected,
-        f"{_rgb(found)} (in {len(wrong)} of {len(judged)} frames checked)",
+        f"{_rgb(colours)} (in {len(wrong)} of {len(judged)} frames checked)",
         f"Composite the renders on {_rgb(declared)}, or score them as they are with --any-background.",
     )
 
@@ -368,7 +368,7 @@ def find_images(
     if not folder.is_dir():
         raise InputError(folder, "", "a folder of images", "no such folder")
     named = named_renders(names, folder, config, clips) if names and config is not None else None
-    found: dict[tuple[str, FrameKey], Render] = {}
+    images: dict[tuple[str, FrameKey], Render] = {}
     missing: list[tuple[str, FrameKey]] = []
     for task, protocol in protocols.items():
         for key in protocol.keys:
@@ -380,9 +380,9 @@ def find_images(
             if render is None or not render.image.is_file():
                 missing.append((task, key))
             else:
-                found[task, key] = render
+                images[task, key] = render
     if missing:
-        expected = f"an image for each of {len(found) + len(missing)} frames"
+        expected = f"an image for each of {len(images) + len(missing)} frames"
         first = "; ".join(f"{task} {key}" for task, key in missing[:SHOWN])
         if named is None:
             looked = ", ".join(str(p.relative_to(folder)) for p in _places(folder, *missing[0], len(clips)))
@@ -395,14 +395,14 @@ def find_images(
             )
         raise InputError(folder, "", expected, f"{len(missing)} without, such as {first}", remedy)
     for clip in clips:
-        frames = {key: render for (_, key), render in found.items() if key.subject == clip.subject}
+        frames = {key: render for (_, key), render in images.items() if key.subject == clip.subject}
         for key, render in frames.items():
             camera = clip.cameras[key.camera]
             _check(render.image, (camera.width, camera.height))
             if render.alpha is not None:
                 _check(render.alpha, (camera.width, camera.height))
         check_truth(clip, frames, frames)
-    return found
+    return images
 
 
 def _places(folder: Path, task: str, key: FrameKey, subjects: int) -> list[Path]:

@@ -60,11 +60,11 @@ def named_renders(names: str, folder: Path, config: RunConfig, clips: Sequence[C
     spec: DatasetSpec = get("datasets", config.reader)
     found: Renders = {}
     for clip, (path, _) in zip(clips, found_captures(spec, Path(config.data), config.reader_settings)):
-        own = folder / clip.subject if (folder / clip.subject).is_dir() else folder
-        if own == folder and len(clips) > 1:
+        inside = folder / clip.subject if (folder / clip.subject).is_dir() else folder
+        if inside == folder and len(clips) > 1:
             raise InputError(folder, clip.subject, "a folder with its images for each subject", "none")
         listing: Listing = resolve(spec.listing)(path) if spec.listing else {}
-        found |= renders(own, clip, listing)
+        found |= renders(inside, clip, listing)
     return found
 
 
@@ -81,18 +81,18 @@ def check_truth(clip: Clip, renders: Renders, keys: Iterable[FrameKey], count: i
         assert path is not None
         if not path.is_file():
             continue
-        truth, own = read_png(path), clip.image(key).astype(np.float32)
+        truth, image = read_png(path), clip.image(key).astype(np.float32)
         if renders[key].alpha is not None:
             mask = clip.mask(key)
             if mask is None:
                 continue  # the background of the image is unknown
             ground = 255 * np.asarray(clip.background, np.float32)
-            own -= (1 - mask[..., None].astype(np.float32) / 255) * ground
-        if truth.shape != own.shape:
+            image -= (1 - mask[..., None].astype(np.float32) / 255) * ground
+        if truth.shape != image.shape:
             found = f"one of {truth.shape[1]} x {truth.shape[0]}"
-            expected = f"the ground truth of {key}, {own.shape[1]} x {own.shape[0]} pixels"
+            expected = f"the ground truth of {key}, {image.shape[1]} x {image.shape[0]} pixels"
             raise InputError(path, "size", expected, found, "Train and render at the capture's size.")
-        error = float(np.sqrt(np.mean((truth.astype(np.float32) - own) ** 2)))
+        error = float(np.sqrt(np.mean((truth.astype(np.float32) - image) ** 2)))
         if error > TRUTH_RMS:
             expected = f"the ground truth of {key}"
             found = f"an image that differs by {error:.1f} of 255 (root mean square)"
@@ -138,7 +138,7 @@ def _listed(path: Path, folder: Path, clips: Sequence[Clip]) -> Renders:
     if len(set(header)) != len(header) or not needed <= set(header) <= allowed:
         raise InputError(path, "line 1", f"the columns {', '.join(sorted(needed))}", ", ".join(header))
     by_subject = {clip.subject: clip for clip in clips}
-    known = {key for clip in clips for key in every_frame(clip)}
+    keys = {key for clip in clips for key in every_frame(clip)}
     found: Renders = {}
     for line, row in rows:
         where = f"line {line}"
@@ -153,9 +153,9 @@ def _listed(path: Path, folder: Path, clips: Sequence[Clip]) -> Renders:
             raise InputError(path, f"{where}, timestep", "a whole number", repr(entry["timestep"]))
         subject = entry.get("subject", "") or next(iter(by_subject))
         key = FrameKey(subject, entry["sequence"], int(entry["timestep"]), entry["camera"])
-        if key not in known:
+        if key not in keys:
             expected = "a frame of the capture"
-            example = f"Its frames are named like {min(known)} (subject/sequence/timestep/camera)."
+            example = f"Its frames are named like {min(keys)} (subject/sequence/timestep/camera)."
             raise InputError(path, where, expected, str(key), example)
         if key in found:
             raise InputError(path, where, "each frame once", f"{key} again")
@@ -267,10 +267,10 @@ def _pose_files(config: RunConfig, clips: Sequence[Clip]) -> dict[tuple[str, int
     spec: DatasetSpec = get("datasets", config.reader)
     if not spec.pose_files:
         return {}
-    found = found_captures(spec, Path(config.data), config.reader_settings)
+    captures = found_captures(spec, Path(config.data), config.reader_settings)
     return {
         (clip.subject, timestep): Path(file).absolute()
-        for clip, (path, _) in zip(clips, found)
+        for clip, (path, _) in zip(clips, captures)
         for timestep, file in resolve(spec.pose_files)(path).items()
     }
 

@@ -92,27 +92,27 @@ def verify_runs(settings: VerifySettings, progress: Progress = no_progress) -> C
     texts, data, codes = [], [], []
     for name in settings.runs:
         try:
-            found = verify(Path(name), settings, progress)
+            findings = verify(Path(name), settings, progress)
         except InputError as error:
             texts.append(f"{name}: Verify: missing or invalid: {error}")
             data.append({"run": name, "error": str(error)})
             codes.append(ExitCode.NO_VERDICT)
             continue
-        texts.append(found.text(name))
-        data.append({"run": name, **asdict(found)})
-        codes.append(ExitCode.NEGATIVE if found.mismatches else ExitCode.OK)
+        texts.append(findings.text(name))
+        data.append({"run": name, **asdict(findings)})
+        codes.append(ExitCode.NEGATIVE if findings.mismatches else ExitCode.OK)
     code = max(codes, key=(ExitCode.OK, ExitCode.NO_VERDICT, ExitCode.NEGATIVE).index)
     return CommandResult("\n".join(texts), {"runs": data}, code == ExitCode.OK, code)
 
 
 def verify(run: Path, settings: VerifySettings, progress: Progress = no_progress) -> Findings:
     """Compare captures, protocols, avatars and values of a run with its record."""
-    folder, found = RunFolder(run), Findings()
+    folder, findings = RunFolder(run), Findings()
     manifest = folder.read_manifest()
     manifest.check_done(folder.manifest)
     if drive := manifest.configuration.drive:
-        there = f"those of {drive.name}, which are rendered and scored at once"
-        raise InputError(folder.manifest, "configuration.conditions", "frames of a capture", there)
+        answer = f"those of {drive.name}, which are rendered and scored at once"
+        raise InputError(folder.manifest, "configuration.conditions", "frames of a capture", answer)
     trained = any(method.implementation for method in manifest.methods)  # otherwise images, of `evaluate`
     used: Any = ("methods", "metrics") if trained else ("metrics",)
     with tempfile.TemporaryDirectory() as name:
@@ -122,17 +122,17 @@ def verify(run: Path, settings: VerifySettings, progress: Progress = no_progress
         for clip in manifest.clips:
             now = fingerprints.get(clip.subject, "no such capture")
             if now != clip.fingerprint:
-                found.differ(f"{folder.manifest}, fingerprint of {clip.subject}", clip.fingerprint, now)
+                findings.differ(f"{folder.manifest}, fingerprint of {clip.subject}", clip.fingerprint, now)
         protocols = make_protocols(config.tasks, clips, config.frames_per_task)
         for task in sorted({*protocols, *manifest.protocols}):
             recorded = manifest.protocols.get(task)
-            made = ProtocolRecord.of(protocols[task]) if task in protocols else None
-            if made != recorded:
-                wanted, there = (each.hash if each else "none" for each in (made, recorded))
-                there = "other frames or rules of this hash" if wanted == there else there
-                found.differ(f"{folder.manifest}, protocol of {task}", wanted, there)
-        if found.mismatches:
-            return found
+            planned = ProtocolRecord.of(protocols[task]) if task in protocols else None
+            if planned != recorded:
+                wanted, answer = (each.hash if each else "none" for each in (planned, recorded))
+                answer = "other frames or rules of this hash" if wanted == answer else answer
+                findings.differ(f"{folder.manifest}, protocol of {task}", wanted, answer)
+        if findings.mismatches:
+            return findings
         folder.read_rows(manifest)
         rows = Rows.read(folder.rows)
         rows.check_protocols(folder.rows, {task: protocol.hash for task, protocol in protocols.items()})
@@ -142,9 +142,9 @@ def verify(run: Path, settings: VerifySettings, progress: Progress = no_progress
         names = {metric.name for metric in manifest.metrics}
         metrics = [metric for metric in resolve_metrics(config) if metric.name in names]
         for index, job in enumerate(jobs):
-            _verify_cell(job, job.rows_of(rows), metrics, settings.render, found)
+            _verify_cell(job, job.rows_of(rows), metrics, settings.render, findings)
             progress(index + 1, len(jobs), job.name)
-    return found
+    return findings
 
 
 def _verify_cell(
@@ -158,8 +158,8 @@ def _verify_cell(
     stored = bool(job.method.spec.implementation) and job.condition.derive in (Named(), CODED_VARIANT)
     made_from = job.cell.record.get("fingerprint")
     if job.method.spec.implementation and made_from != job.fit_fingerprint:
-        there = "none" if made_from is None else "one of other settings, data or version"
-        found.differ(job.cell.file, f"the avatar of {job.name}", there)
+        answer = "none" if made_from is None else "one of other settings, data or version"
+        found.differ(job.cell.file, f"the avatar of {job.name}", answer)
     unreadable = [path for path in job.frame_paths if not _can_be_scored(job, path)]
     for path in unreadable:
         found.differ(path, "a frame of its size", "one that is damaged" if path.exists() else "no such file")

@@ -62,10 +62,10 @@ def check_reader(spec: DatasetSpec, path: Path, settings: Mapping[str, Any] | No
     breaches: list[str] = []
     clips: list[Clip] = []
     with attempt(breaches, "reading the capture"):
-        found = resolve(spec.find)(path) if spec.find else [path]
-        if not found:
+        paths = resolve(spec.find)(path) if spec.find else [path]
+        if not paths:
             return [f"find lists nothing under {path}"]
-        breaches += [f"find lists {one}, which is not there" for one in found if not Path(one).exists()]
+        breaches += [f"find lists {one}, which is not there" for one in paths if not Path(one).exists()]
         clips = read(path)
     for clip in clips:
         with attempt(breaches, f"checking the clip {getattr(clip, 'subject', '?')!r}"):
@@ -128,11 +128,11 @@ def _head(clip: Clip) -> Iterator[str]:
         "skinning_weights": ((vertices, joints), np.floating),
         "parents": ((joints,), np.integer),
     }
-    found = [b for name, w in wanted.items() for b in _shaped(f"head.{name}", getattr(head, name), *w)]
-    yield from found
+    breaches = [b for name, w in wanted.items() for b in _shaped(f"head.{name}", getattr(head, name), *w)]
+    yield from breaches
     yield from _shaped("shape", clip.shape, (directions,))
     yield from _shaped("static_offset", clip.static_offset, (vertices, 3))
-    if found:
+    if breaches:
         return
     if head.faces.min() < 0 or head.faces.max() >= vertices:
         yield "head.faces names vertices that are not there"
@@ -179,11 +179,13 @@ def _poses(clip: Clip) -> Iterator[str]:
         directions = clip.head.expression_basis.shape[-1] if isinstance(clip.head, HeadAsset) else None
         parts: dict[str, int | None] = {"expression": directions, "rotation": 3, "neck": 3, "jaw": 3}
         parts |= {"eyes": 6, "translation": 3} | ({} if pose.eyelids is None else {"eyelids": 2})
-        found = [b for n, size in parts.items() for b in _shaped(f"{n} {where}", getattr(pose, n), (size,))]
+        breaches = [
+            b for n, size in parts.items() for b in _shaped(f"{n} {where}", getattr(pose, n), (size,))
+        ]
         if (pose.subject, pose.timestep) != (clip.subject, timestep):
-            found.append(f"subject and timestep {where} are {pose.subject!r} and {pose.timestep}")
-        if found:
-            yield from found
+            breaches.append(f"subject and timestep {where} are {pose.subject!r} and {pose.timestep}")
+        if breaches:
+            yield from breaches
             return  # the other parameters are the same
 
 

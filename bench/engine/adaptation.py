@@ -59,8 +59,8 @@ def adapter() -> Adapter:
     entries = entry_points(group="headbench.adaptation")
     if not entries:
         raise HeadbenchError("nothing is registered as headbench.adaptation; install headbench again")
-    found: Adapter = next(iter(entries)).load()
-    return found
+    registered: Adapter = next(iter(entries)).load()
+    return registered
 
 
 def plan(clip: Clip, needs: MethodNeeds, heads: Mapping[str, str]) -> Adaptation | None:

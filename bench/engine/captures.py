@@ -37,8 +37,8 @@ def open_clips(config: RunConfig, *, use_cache: bool = True, only: int | None = 
     if not root.exists():
         raise InputError(root, "--data", "a capture folder", "no such folder")
     clips: list[Clip] = []
-    found = found_captures(spec, root, config.reader_settings, use_cache=use_cache)
-    for path, read in found if only is None else found[only : only + 1]:
+    captures = found_captures(spec, root, config.reader_settings, use_cache=use_cache)
+    for path, read in captures if only is None else captures[only : only + 1]:
         with progress(f"reading {path.name}") as report:
             clips.append(changed(_reduced(_checked(read(report)), config), config.clip, config))
     subjects = [clip.subject for clip in clips]
@@ -75,11 +75,11 @@ def reader_of(root: str) -> str:
     """Name of the reader for a run's capture: ga, unless only another reader finds one."""
     if not Path(root).exists() or finds(get("datasets", "ga"), Path(root)):
         return "ga"
-    found = [name for name, spec in readers().items() if finds(spec, Path(root))]
-    if len(found) > 1:
+    names = [name for name, spec in readers().items() if finds(spec, Path(root))]
+    if len(names) > 1:
         expected = "a capture that one reader knows"
-        raise InputError(root, "", expected, f"one for {', '.join(found)}", "Choose with the setting reader.")
-    return found[0] if found else "ga"
+        raise InputError(root, "", expected, f"one for {', '.join(names)}", "Choose with the setting reader.")
+    return names[0] if names else "ga"
 
 
 def capture_configuration(
@@ -114,13 +114,13 @@ def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dic
         raise InputError("--data", where, expected, "none", "Name the folder of the capture with --data.")
     defaults = {name: each.default for name, each in inspect.signature(make).parameters.items()}
     arguments = {name: default for name, default in defaults.items() if name not in given}
-    found = build_arguments(
+    settings = build_arguments(
         make,
         {"edition": 1, **{key: value for key, value in recorded.items() if key != "style"}},
         where,
         harness=given,
     )
-    return {**arguments, **found, "only": subject}
+    return {**arguments, **settings, "only": subject}
 
 
 def located(config: RunConfig, **places: str | None) -> RunConfig:

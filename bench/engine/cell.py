@@ -340,8 +340,8 @@ def _measure_avatar(job: Job, spec: MetricSpec, avatar: Avatar) -> Measurement |
         if not spec.machine_bound:
             return metric(avatar, pairs)  # type: ignore[no-any-return]
         with ProcessorLoad(job.device, wait=True) as load:
-            found = metric(avatar, pairs)
-        return Measurement(found.value, {**found.details, **load.details})
+            value = metric(avatar, pairs)
+        return Measurement(value.value, {**value.details, **load.details})
     except UnavailableError as error:
         return error
 

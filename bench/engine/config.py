@@ -19,8 +19,7 @@ from ..configuration import build, build_arguments, deciding_settings, merge, se
 from ..contracts import Budget, TaskName
 from ..errors import InputError
 from ..io.files import check_name, check_utf8
-from ..registry import discover, get, is_outside, resolve, unknown
-from ..source import code_digest, forget_code
+from ..registry import code_digest, discover, forget_code, get, is_outside, resolve, unknown
 from ..specs import ConditionSpec, MethodSpec, MetricSpec, ProfileSpec
 
 CANONICAL = "canonical"
@@ -125,9 +124,9 @@ class RunConfig:
 
 def build_run_config(values: Mapping[str, Any], source: str) -> RunConfig:
     """Build `RunConfig` as `build` does; for a misplaced nested key, such as ``iterations``, the error names its full path."""
-    known = {each.name for each in fields(RunConfig)}
+    names = {each.name for each in fields(RunConfig)}
     for key in values:
-        if isinstance(key, str) and key not in known and not get_close_matches(key, known, 1, 0.8):
+        if isinstance(key, str) and key not in names and not get_close_matches(key, names, 1, 0.8):
             places = _setting_places()
             near = get_close_matches(key, places, 1, 0.7)
             if near:
@@ -335,24 +334,24 @@ def resolve_metrics(config: RunConfig) -> list[MetricSpec]:
         return list(get("conditions", config.drive.name).metrics)
     profiles: list[ProfileSpec] = [get("profiles", name) for name in config.metric_profiles]
     defined = {metric.name for metric in get("profiles", CANONICAL).metrics}
-    found: list[MetricSpec] = []
+    specs: list[MetricSpec] = []
     for name in config.metrics:
         spec: MetricSpec = get("metrics", name)
         if spec.name not in defined:
-            found.append(spec)
+            specs.append(spec)
             continue
         named = [f"{spec.name}@{profile.name}" for profile in profiles]
         of_profiles = [m for p in profiles for m in p.metrics if m.name == spec.name or m.name in named]
         if not of_profiles:
             expected = f"one that the profiles {', '.join(config.metric_profiles)} define"
             raise InputError("metrics", spec.name, expected, "none of them does", "Leave it out.")
-        found += of_profiles
+        specs += of_profiles
     first = profiles[0].name
-    for metric in found:
+    for metric in specs:
         for name in (metric.name, *metric.tables):
             check_name(name, "registry of metrics", f"name and tables of {metric.name}")
     return [
-        replace(m, tables=("comparison", *m.tables)) if m.profile == first != CANONICAL else m for m in found
+        replace(m, tables=("comparison", *m.tables)) if m.profile == first != CANONICAL else m for m in specs
     ]
 
 

@@ -282,9 +282,9 @@ def check_settings(cells: Iterable[tuple[ResolvedMethod, Condition]]) -> None:
     for method, _ in cells:
         if not method.spec.implementation:
             continue  # a folder of images
-        made = method.create()
-        if isinstance(made, CheckedMethod):
-            made.check(None, method.budget)
+        created = method.create()
+        if isinstance(created, CheckedMethod):
+            created.check(None, method.budget)
 
 
 def _described(
@@ -353,9 +353,9 @@ def make_jobs(
 
     def form(clip: Clip, method: ResolvedMethod, condition: Condition) -> AdaptedClip | None:
         """The clip under a condition, adapted to a method; None if that is the clip itself."""
-        own = shown[clip.subject, repr(condition.clip)]
-        made = adapted[own.fingerprint, MethodNeeds.of(method.spec)]
-        return made or (None if own is clip else AdaptedClip(own))
+        trained_on = shown[clip.subject, repr(condition.clip)]
+        form_of_training = adapted[trained_on.fingerprint, MethodNeeds.of(method.spec)]
+        return form_of_training or (None if trained_on is clip else AdaptedClip(trained_on))
 
     def source_of(clip: Clip, method: ResolvedMethod, condition: Condition, seed: int) -> Cell | None:
         """The cell whose avatar is used; None for a training. What is derived or driven is the plain avatar."""
@@ -413,7 +413,7 @@ def _adapted(
                     raise
                 key = f"{error.key} of {method.spec.name}"
                 raise InputError(error.file, key, error.expected, error.found, error.remedy) from error
-    found: dict[tuple[str, MethodNeeds], AdaptedClip | None] = dict.fromkeys(planned)
+    forms: dict[tuple[str, MethodNeeds], AdaptedClip | None] = dict.fromkeys(planned)
     with output_inside(out.root):
         for subject in {clip.subject for clip, step in planned.values() if step is not None}:
             for folder in stored:
@@ -422,8 +422,8 @@ def _adapted(
         for (fingerprint, needs), (clip, step) in planned.items():
             if step is not None:
                 folder, label = out.adapted / clip.subject, f"adapting {clip.subject}"
-                found[fingerprint, needs] = adaptation.apply(step, needs, folder, label)
-    return found
+                forms[fingerprint, needs] = adaptation.apply(step, needs, folder, label)
+    return forms
 
 
 def _copy_missing(source: Path, folder: Path) -> None:

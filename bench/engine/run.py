@@ -176,8 +176,8 @@ def _check_goes_on(job: Job, error: Exception) -> None:
 def _codec(label: str, jobs: Sequence[Job]) -> str | None:
     """Codecs of the measured avatars of a method and condition, see `MethodRecord`."""
     records = [job.cell.record for job in jobs if job.label == label]
-    found = {record["codec"] for record in records if "codec" in record}
-    return "; ".join(sorted(found)) if found else None
+    codecs = {record["codec"] for record in records if "codec" in record}
+    return "; ".join(sorted(codecs)) if codecs else None
 
 
 def write_reports(run: FinishedRun) -> list[Path]:
@@ -217,13 +217,14 @@ def warn_of_missing_metrics(metrics: Sequence[MetricSpec], clip: Clip) -> None:
 def check_capture(config: RunConfig, clip: Clip) -> None:
     """Raise `InputError` for errors of a capture that change results, see `DatasetSpec.errors`."""
     spec: DatasetSpec = get("datasets", config.reader)
-    found = resolve(spec.errors)(clip) if spec.errors else []
-    if found:
+    errors = resolve(spec.errors)(clip) if spec.errors else []
+    if errors:
         raise InputError(
             config.data,
             f"capture of {clip.subject}",
             "a capture without errors that change results",
-            found[0].rstrip(".") + (f"; and {counted(len(found) - 1, 'other error')}" if found[1:] else ""),
+            errors[0].rstrip(".")
+            + (f"; and {counted(len(errors) - 1, 'other error')}" if errors[1:] else ""),
             "`headbench lint` shows more; `headbench run --unchecked` trains all the same.",
         )
 

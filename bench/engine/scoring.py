@@ -249,11 +249,11 @@ def _temporal(
 
     The first frame after a gap uses the following one, so that every frame has a value.
     """
-    known = set(keys)
+    present = set(keys)
 
     def score(key: FrameKey) -> Score:
         beside = (key._replace(timestep=key.timestep + step) for step in (-1, 1))
-        neighbour = next((other for other in beside if other in known), None)
+        neighbour = next((other for other in beside if other in present), None)
         if neighbour is None:
             return _missing(
                 spec, key, f"{spec.label} needs neighbouring timesteps; here frames are left out."
@@ -276,10 +276,12 @@ def _sequences(
     for key in keys:
         place = key.subject, key.sequence, key.camera
         if place not in values:
-            own = sorted(other for other in keys if (other.subject, other.sequence, other.camera) == place)
+            sequence = sorted(
+                other for other in keys if (other.subject, other.sequence, other.camera) == place
+            )
             images, truths = (
-                list(_ahead(pool, frames.render, own)),
-                list(_ahead(pool, frames.clip.image, own)),
+                list(_ahead(pool, frames.render, sequence)),
+                list(_ahead(pool, frames.clip.image, sequence)),
             )
             try:
                 values[place] = float(metric(images, truths))

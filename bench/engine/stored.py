@@ -105,11 +105,11 @@ def registered_name(method: ResolvedMethod) -> str:
 def avatar_folder(folder: Path) -> Path:
     """The folder with the files of an avatar: this one, or ``avatar`` in the cell of a run."""
     inside = folder / "avatar"
-    found = inside if inside.is_dir() else folder
-    if not found.is_dir() or not any(path.is_file() for path in entries(found)):
-        reason = "no such folder" if not found.is_dir() else "one without files"
+    avatar = inside if inside.is_dir() else folder
+    if not avatar.is_dir() or not any(path.is_file() for path in entries(avatar)):
+        reason = "no such folder" if not avatar.is_dir() else "one without files"
         raise InputError(folder, "", f"the {AVATAR_FOLDER}", reason)
-    return found
+    return avatar
 
 
 @dataclass(frozen=True)
@@ -122,12 +122,12 @@ class StoredAvatar:
 
     def load(self, device: str = "cpu") -> Avatar:
         """Read the avatar."""
-        head, known = self.folder / HEAD_FILE, self.record["head_digest"]
-        if known and not head.is_file():
+        head, recorded = self.folder / HEAD_FILE, self.record["head_digest"]
+        if recorded and not head.is_file():
             raise InputError(head, "", "the head model that the avatar was stored with", "no such file")
-        if known and (found := digest_file(head)) != known:
-            expected = f"the head model that the avatar was stored with, SHA-256 {known[:12]}"
-            raise InputError(head, "", expected, f"another, SHA-256 {found[:12]}")
+        if recorded and (current := digest_file(head)) != recorded:
+            expected = f"the head model that the avatar was stored with, SHA-256 {recorded[:12]}"
+            raise InputError(head, "", expected, f"another, SHA-256 {current[:12]}")
         avatar: Avatar = self.method.create().load(self.folder, device=device)
         return avatar
 

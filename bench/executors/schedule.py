@@ -33,6 +33,7 @@ from .task import (
     TASK_LOG,
     Executor,
     Task,
+    TaskOutcome,
     TaskResult,
     execute_task,
     forget_outcome,
@@ -224,8 +225,8 @@ class Schedule:
                 return replace(task, restarts=task.restarts + 1)
             reason = f"HeadbenchError: {lost}" + (f", {task.restarts + 1} times" if task.restarts else "")
             # The process ended before it could record this.
-            failed = {**(outcome or {}), "status": "failed", "speed": self.speed, "reason": reason}
-            update_record(task.folder, task=failed)
+            failed: TaskOutcome = {"status": "failed", "speed": self.speed, "reason": reason}
+            update_record(task.folder, task={**(outcome or failed), **failed})
         failures[task.place] = reason
         log.error("%s failed: %s; see %s", task.place, reason, task.folder / TASK_LOG)
         return None

@@ -98,8 +98,8 @@ class Slurm:
         self._running: list[Task] = []
         self._unanswered = 0
         self._warned: set[str] = set()
-        known = read_submitted(root)
-        self._numbers = known["jobs"] if known is not None and known["speed"] == speed else {}
+        submitted = read_submitted(root)
+        self._numbers = submitted["jobs"] if submitted is not None and submitted["speed"] == speed else {}
         self._known = dict(self._numbers)
         self._strays_gone = False
 
@@ -112,11 +112,11 @@ class Slurm:
         """Submit jobs."""
         left = []
         for task in tasks:
-            known = self._known.pop(task.place, None)
-            if known is None:
+            number_before = self._known.pop(task.place, None)
+            if number_before is None:
                 left.append(task)
             else:
-                self._jobs[task.place] = _Job(task, known, earlier=True)
+                self._jobs[task.place] = _Job(task, number_before, earlier=True)
         if self._jobs and len(left) < len(tasks):
             log.info(
                 "following %d jobs that were submitted before, with their earlier settings",
@@ -126,10 +126,10 @@ class Slurm:
             _cancel_others(job_name(self._root), set(self._numbers.values()))
             self._strays_gone = True
         for start in range(0, len(left), MAX_ARRAY):
-            part = left[start : start + MAX_ARRAY]
-            for task in part:
+            array = left[start : start + MAX_ARRAY]
+            for task in array:
                 forget_outcome(task.folder, self._speed)
-            for task, number in zip(part, self._submit(part)):
+            for task, number in zip(array, self._submit(array)):
                 self._jobs[task.place] = _Job(task, number)
                 self._numbers[task.place] = number
             submitted: Submitted = {"speed": self._speed, "jobs": self._numbers}
@@ -147,18 +147,18 @@ class Slurm:
             log.warning("%s; trying again", error)
             return []
         self._unanswered = 0
-        found = []
-        own = [(job.task, states[job.number]) for job in self._jobs.values() if job.number in states]
-        self._running = [task for task, each in own if each.state == "RUNNING"]
-        for reason in {each.reason for _, each in own} & STUCK - self._warned:
+        results = []
+        listed = [(job.task, states[job.number]) for job in self._jobs.values() if job.number in states]
+        self._running = [task for task, each in listed if each.state == "RUNNING"]
+        for reason in {each.reason for _, each in listed} & STUCK - self._warned:
             log.warning(WAITING, reason, job_name(self._root))
             self._warned.add(reason)
         for place, job in list(self._jobs.items()):
             ended = None if job.number in states else self._look(job)
             if ended is not None:
-                found.append(ended)
+                results.append(ended)
                 del self._jobs[place]
-        return found
+        return results
 
     def close(self) -> None:
         """Leave the jobs to the cluster; remove the list if all have ended."""
@@ -217,8 +217,8 @@ class Slurm:
             asked = f"partition {settings.partition or 'by default'}, {settings.cpus} cpus, {settings.gpus} gpus, "
             asked += f"{settings.memory_gb:g} GB, {settings.hours:g} hours"
             remedy = "`sinfo` lists partitions and what they have."
-            found = " ".join(str(error).split()).replace("sbatch: error: ", "")
-            raise InputError("execution.slurm", asked, "jobs that sbatch takes", found, remedy) from error
+            answer = " ".join(str(error).split()).replace("sbatch: error: ", "")
+            raise InputError("execution.slurm", asked, "jobs that sbatch takes", answer, remedy) from error
 
 
 def run_job(task: Task) -> None:
@@ -249,9 +249,9 @@ def job_name(root: Path) -> str:
     return f"headbench-{root.name}-{digest(str(root.resolve()))[:8]}"
 
 
-def _cancel_others(name: str, known: set[str]) -> None:
+def _cancel_others(name: str, numbers: set[str]) -> None:
     """Cancel unlisted jobs with this name, and wait until they have ended, since they may be running."""
-    strays = [number for number, job in queue().items() if job.name == name and number not in known]
+    strays = [number for number, job in queue().items() if job.name == name and number not in numbers]
     if not strays:
         return
     log.warning("%d jobs that an earlier process submitted and did not list are cancelled", len(strays))
@@ -295,10 +295,10 @@ def end_of(number: str) -> _State:
         text = _ask("scontrol", "show", "job", number)
     except HeadbenchError:
         return _State("UNKNOWN", "", 0)
-    found = dict(re.findall(r"(\w+)=(\S*)", text))
-    reason = found.get("Reason", "None")
-    code = found.get("ExitCode", "0").partition(":")[0]
-    return _State(found.get("JobState", "UNKNOWN"), "" if reason == "None" else f" ({reason})", int(code))
+    fields = dict(re.findall(r"(\w+)=(\S*)", text))
+    reason = fields.get("Reason", "None")
+    code = fields.get("ExitCode", "0").partition(":")[0]
+    return _State(fields.get("JobState", "UNKNOWN"), "" if reason == "None" else f" ({reason})", int(code))
 
 
 def _ask(*command: str) -> str:

@@ -106,9 +106,11 @@ def time_left(cells: Sequence[CellState]) -> tuple[float | None, bool]:
     means = {method: sum(each) / len(each) for method, each in took.items()}
     left = [cell for cell in cells if cell.state in ("waiting", "running")]
     begun = [cell for cell in left if cell.state == "running" or cell.seconds is None]
-    known = [max(0.0, means[cell.method] - (cell.seconds or 0.0)) for cell in begun if cell.method in means]
+    estimates = [
+        max(0.0, means[cell.method] - (cell.seconds or 0.0)) for cell in begun if cell.method in means
+    ]
     at_once = max(1, sum(cell.state == "running" for cell in left))
-    return (sum(known) / at_once, len(known) < len(left)) if known else (None, False)
+    return (sum(estimates) / at_once, len(estimates) < len(left)) if estimates else (None, False)
 
 
 def cell_states(folder: RunFolder, manifest: Manifest) -> list[CellState]:
@@ -119,25 +121,25 @@ def cell_states(folder: RunFolder, manifest: Manifest) -> list[CellState]:
     failed = dict(_failed(folder, manifest))
     speed = any(metric.is_speed for metric in manifest.metrics)
     works = is_locked(folder.root)
-    found = []
+    states = []
     for clip, method, seed in product(manifest.clips, manifest.methods, manifest.configuration.seeds):
         key = clip.subject, method.label, seed
         cell = folder.cell(*key)
         place = cell.folder.relative_to(folder.root).as_posix()
         outcome = read_outcome(cell.folder)
         if outcome is not None:
-            found.append(_of_outcome(key, cell.folder, outcome, speed, jobs.get(place, ""), queued))
+            states.append(_of_outcome(key, cell.folder, outcome, speed, jobs.get(place, ""), queued))
         elif key in failed:
-            found.append(CellState(*key, "failed", failed[key]))
+            states.append(CellState(*key, "failed", failed[key]))
         elif {metric.name for metric in manifest.metrics} <= {*cell.record.get("measured", ())}:
-            found.append(CellState(*key, "done"))
+            states.append(CellState(*key, "done"))
         elif queued and place in jobs and jobs[place] in queued:
-            found.append(CellState(*key, "waiting", f"job {jobs[place]} is {queued[jobs[place]].shown}"))
+            states.append(CellState(*key, "waiting", f"job {jobs[place]} is {queued[jobs[place]].shown}"))
         elif works and cell.folder.exists() and not jobs:
-            found.append(CellState(*key, "running"))
+            states.append(CellState(*key, "running"))
         else:
-            found.append(CellState(*key, "waiting"))
-    return found
+            states.append(CellState(*key, "waiting"))
+    return states
 
 
 def _of_outcome(

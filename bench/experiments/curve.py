@@ -118,12 +118,12 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Comm
 
 def variant(method: MethodSpec, trained: Path, out: Path, clip: Clip, device: str, *, name: str) -> Avatar:
     """Create a named variant of a trained avatar, see `MethodSpec.variants`; the registered change "variant"."""
-    known = []
+    names = []
     for each in resolve(method.variants)(trained, clip, device):
         if each.name == name:
             return each.make(out)  # type: ignore[no-any-return]
-        known.append(each.name)
-    raise InputError(trained, "variant", f"one of {', '.join(known)}", name)
+        names.append(each.name)
+    raise InputError(trained, "variant", f"one of {', '.join(names)}", name)
 
 
 MOST_TRACKING_ERROR = 4.0

@@ -432,8 +432,8 @@ def _judged(
         view = plan.views[frame.view]
         if frame.pose is not pose:
             pose, splats = frame.pose, splats_of(avatar, frame.pose)
-        rendered, found = render_measured(avatar, view.camera, frame.pose, background, splats)
-        measured.append(found)
+        rendered, measures = render_measured(avatar, view.camera, frame.pose, background, splats)
+        measured.append(measures)
         sample, follows = frame.name not in (TYPICAL, PATH), frame.name == PATH and frame.number > 0
         stem = f"{PATH}-{frame.number:02d}" if frame.name == PATH else frame.name
         place = job.cell.folder / f"{stem}_{view.camera.id}.png"
@@ -445,8 +445,8 @@ def _judged(
         if truths is None:
             checks, response, flicker = without_truth(missing)
         else:
-            truth, own = truths.at(view.camera, frame.pose)
-            entry["truth"] = own[0].relative_to(job.run).as_posix()
+            truth, mask = truths.at(view.camera, frame.pose)
+            entry["truth"] = mask[0].relative_to(job.run).as_posix()
             compared.append(TruthPair.of(rendered, truth))
             checks = scores.appearance(compared[-1], extrapolated=view.extrapolated)
             small = truths.view(view.camera)
@@ -461,11 +461,11 @@ def _judged(
     between = [m for m, view in zip(measured, plan.views) if not view.extrapolated]
     middle = typical(between or measured[:count])
     frames = []
-    for frame, found, (checks, changes) in zip(plan.frames, measured, against):
+    for frame, measures, (checks, changes) in zip(plan.frames, measured, against):
         reference = middle if frame.name == TYPICAL else measured[frame.view]
         limits = VIEW_LIMITS if frame.name == TYPICAL else EXPRESSION_LIMITS
         frames.append(
-            JudgedFrame(_key(job, plan, frame), [*judge(found, reference, limits), *checks], changes)
+            JudgedFrame(_key(job, plan, frame), [*judge(measures, reference, limits), *checks], changes)
         )
     for entry, judged in zip(shown, frames):
         entry["values"] = {check.name: check.value for check in (*judged.checks, *judged.changes)}

@@ -32,8 +32,8 @@ from ..protocol import evenly
 
 def tracking_error(steps: Sequence[Mapping[str, Any]]) -> float | None:
     """Tracking error level of a synthetic capture, from the steps of its clip; None for a recording."""
-    made = steps[0].get("parameters", {}).get("synthetic") if steps else None
-    return float(made.get("tracking_error", 0.0)) if made else None
+    settings = steps[0].get("parameters", {}).get("synthetic") if steps else None
+    return float(settings.get("tracking_error", 0.0)) if settings else None
 
 
 def with_tracking_error(clip: Clip, config: RunConfig, *, level: float) -> Clip:
@@ -218,8 +218,8 @@ def _with_frames(clip: Clip, keys: Sequence[FrameKey], chosen: dict[str, list[An
 
 def _as_held_out(clip: Clip) -> HeldOutClip:
     """A clip that allows reading only the frames of its splits."""
-    own = {f.name: getattr(clip, f.name) for f in fields(HeldOutClip) if f.name != "source"}
-    return HeldOutClip(source=clip, **own)
+    values = {f.name: getattr(clip, f.name) for f in fields(HeldOutClip) if f.name != "source"}
+    return HeldOutClip(source=clip, **values)
 
 
 def _spread(cameras: Mapping[str, Camera], names: Sequence[str]) -> list[str]:

@@ -113,9 +113,9 @@ class RecordedAppearance:
         if not keys or len(parts.indices) < LEAST_VERTICES:
             return None
         seen = np.array([_colours_of(clip, parts, key) for key in keys[:: max(1, len(keys) // count)]])
-        known = np.isfinite(seen).any(axis=0)
+        finite = np.isfinite(seen).any(axis=0)
         median = np.full(seen.shape[1:], np.nan)
-        median[known] = np.nanmedian(seen[:, known], axis=0)
+        median[finite] = np.nanmedian(seen[:, finite], axis=0)
         return cls(parts, median)
 
     def difference(self, colours: FloatArray) -> float | None:
@@ -153,8 +153,8 @@ def of_recording(
 
 def mean_known(values: Sequence[float | None]) -> float | None:
     """Mean of the available values; None without any."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+    finite = [value for value in values if value is not None]
+    return float(np.mean(finite)) if finite else None
 
 
 def _colours_of(clip: Clip, parts: RigidVertices, key: FrameKey) -> FloatArray:
@@ -347,20 +347,20 @@ def _judged(driven: Driven, avatar: Avatar, report: Progress) -> tuple[list[Judg
     poses = training_poses(clip)
     means = RigidMean.of(training_poses(source.form.clip)), RigidMean.of(poses)
     # Renders of the avatar's training poses in this view.
-    own = [replace(pose, timestep=None) for pose in poses[:: max(1, len(poses) // REFERENCE_FRAMES)]]
-    reference = typical([render_measured(avatar, camera, pose, background)[1] for pose in own])
+    references = [replace(pose, timestep=None) for pose in poses[:: max(1, len(poses) // REFERENCE_FRAMES)]]
+    reference = typical([render_measured(avatar, camera, pose, background)[1] for pose in references])
     frames, shown = [], []
     for index, key in enumerate(driven.keys):
         driver = source.form.clip.poses[source.form.key(key).timestep]
         pose = retarget(driver, *means, job.clip.subject)
-        frame, found = render_measured(avatar, camera, pose, background)
+        frame, measures = render_measured(avatar, camera, pose, background)
         target = _target(driven, key)
         name = f"{key.subject}_{key.sequence}_{key.timestep:05d}"
         rendered = job.cell.folder / f"{name}_{camera.id}.png"
         original = out / "sources" / f"{name}_{key.camera}.png"
         write_png(original, source.clip.image(key))
         write_frame(rendered, frame)
-        checks = [*judge(found, reference, OWN_LIMITS), identity(appearance, frame, camera, pose)]
+        checks = [*judge(measures, reference, OWN_LIMITS), identity(appearance, frame, camera, pose)]
         frames.append(JudgedFrame(target, checks))
         places = {"source": original, "driven": rendered}
         shown.append({"key": str(target), **{n: p.relative_to(out).as_posix() for n, p in places.items()}})
@@ -376,12 +376,12 @@ def _identity(
     if appearance is None:
         return None
     target, source = driven.job.form.clip, driven.source.form.clip
-    own = [key for key in target.splits.get("self_reenactment", ()) if key.camera == driven.camera.id]
+    keys = [key for key in target.splits.get("self_reenactment", ()) if key.camera == driven.camera.id]
     theirs = [driven.source.form.key(key) for key in driven.keys]
     values = [check.value for frame in frames for check in frame.checks if check.measure == "identity"]
     return {
         "driven": mean_known(values),
-        "own": of_recording(appearance, target, own, REFERENCE_FRAMES),
+        "own": of_recording(appearance, target, keys, REFERENCE_FRAMES),
         "source": of_recording(appearance, source, theirs, REFERENCE_FRAMES),
     }
 

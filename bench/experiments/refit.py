@@ -63,8 +63,8 @@ class FrameFit:
         Both are reduced to at most ``size`` pixels; avatars are not rendered smaller, since splats grow relative to pixels.
         """
         camera, pose = self.view(parameters)
-        part = min(1.0, size / max(camera.width, camera.height))
-        sides = (max(1, round(part * camera.width)), max(1, round(part * camera.height)))
+        scale = min(1.0, size / max(camera.width, camera.height))
+        sides = (max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))
         difference = (
             self.avatar.render(camera, pose, self.background).rgb - self.picture.astype(np.float32) / 255
         )

@@ -219,12 +219,12 @@ def protocols_of(task: TaskWithoutTruth, shown: Sequence[ShownFrames]) -> dict[s
     return {
         name: make_protocol_without_truth(
             task,
-            [clip for each in own for clip in each.clips],
-            [key for each in own for key in each.keys],
-            [size for each in own for size in each.sizes],
-            dict(each.condition for each in own),
+            [clip for each in keys for clip in each.clips],
+            [key for each in keys for key in each.keys],
+            [size for each in keys for size in each.sizes],
+            dict(each.condition for each in keys),
         )
-        for name, own in named.items()
+        for name, keys in named.items()
     }
 
 
@@ -284,10 +284,10 @@ def _rows(job: Job, protocol: Protocol, frames: Sequence[JudgedFrame]) -> list[R
             rows.append(Row(*place, check.region, check.measure, value, protocol.hash, *check.outcome))
     of_avatar = (*whose, "", job.clip.subject, "", -1, "")
     for checks in _by_name(check for frame in frames for check in frame.changes).values():
-        known = [check.value for check in checks if check.value is not None]
-        mean = float(np.mean(known)) if known else math.nan
+        values = [check.value for check in checks if check.value is not None]
+        mean = float(np.mean(values)) if values else math.nan
         broken = [check for check in checks if not check.passed]
-        status, reason = broken[0].outcome if broken else ("ok", "") if known else checks[0].outcome
+        status, reason = broken[0].outcome if broken else ("ok", "") if values else checks[0].outcome
         if broken:
             reason = f"{len(broken)} of {len(checks)} frames; the first: {reason}"
         rows.append(Row(*of_avatar, FULL, checks[0].measure, mean, "", status, reason))
@@ -318,11 +318,11 @@ def _summary(job: Job, frames: Sequence[JudgedFrame]) -> dict[str, Any]:
 
 def _measured(checks: Sequence[LimitCheck]) -> dict[str, float | int | None]:
     """Mean, worst and number of finite values of a measure, and number of values that violate a limit."""
-    known = [check for check in checks if check.value is not None and math.isfinite(check.value)]
+    measured = [check for check in checks if check.value is not None and math.isfinite(check.value)]
     return {
-        "mean": float(np.mean([check.value for check in known])) if known else None,
-        "worst": min(known, key=lambda check: check.worst_first).value if known else None,
-        "frames": len(known),
+        "mean": float(np.mean([check.value for check in measured])) if measured else None,
+        "worst": min(measured, key=lambda check: check.worst_first).value if measured else None,
+        "frames": len(measured),
         "failed": sum(not check.passed for check in checks),
     }
 
@@ -381,5 +381,5 @@ def normals(depth: FloatArray, camera: Camera) -> FloatArray:
     rays = np.stack([columns, rows, np.ones_like(rows)], axis=2) @ np.linalg.inv(camera.K).T
     points = depth[..., None] * rays
     down, right = np.gradient(points, axis=(0, 1))
-    found = np.cross(down, right)
-    return np.asarray(found / np.linalg.norm(found, axis=2, keepdims=True))
+    crossed = np.cross(down, right)
+    return np.asarray(crossed / np.linalg.norm(crossed, axis=2, keepdims=True))

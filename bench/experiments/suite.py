@@ -198,9 +198,9 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
             parts.append((more_seeds, (width, height)))
         if place < settings.large:
             parts.append((large, (2 * width, 2 * height)))
-        for part, size in parts:
+        for planned, size in parts:
             (capture,) = synthesize(
-                part.data,
+                planned.data,
                 subjects=settings.subjects,
                 only=place,
                 cameras=settings.cameras,
@@ -213,14 +213,14 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
                 execution=execution,
                 progress=progress,
             )
-            own = replace(part, data=str(capture), out=str(Path(part.out) / f"{place + 1:02d}"))
-            rows = run(own, execution).rows
-            runs.append(Path(own.out))
+            of_subject = replace(planned, data=str(capture), out=str(Path(planned.out) / f"{place + 1:02d}"))
+            rows = run(of_subject, execution).rows
+            runs.append(Path(of_subject.out))
             failed += rows.failed
             trained = any(not method.spec.trivial for method, _ in cells)
-            if part is config and trained and place < settings.extremes:
+            if planned is config and trained and place < settings.extremes:
                 how = {name: getattr(settings, name) for name in ("executor", "workers", "set")}
-                extremes_run(ExtremesSettings(own.out, **how), progress)
+                extremes_run(ExtremesSettings(of_subject.out, **how), progress)
             ends.append(closing(runs[-1], rows))
             write_text(out / "results.md", suite_report(out, OURS))
     data = {"out": out, "runs": runs, "failed": sorted({*failed})}
@@ -234,9 +234,12 @@ def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
     resolved = resolve_methods(config)
     specs = {method.spec.name: method.spec for method in resolved}
     tracked = settings.tracked_of(tuple(specs))
-    own = tuple(name for name, spec in specs.items() if spec.conversion == "published")
-    found = [Condition(AS_TRACKED, own, as_tracked=True), Condition(TRACKED, tracked, clip=Named(TRACKED))]
-    found += [
+    converted = tuple(name for name, spec in specs.items() if spec.conversion == "published")
+    conditions = [
+        Condition(AS_TRACKED, converted, as_tracked=True),
+        Condition(TRACKED, tracked, clip=Named(TRACKED)),
+    ]
+    conditions += [
         Condition(LEVEL.format(level), tracked, clip=Named("tracking-error", {"level": level}))
         for level in settings.levels
     ]
@@ -247,16 +250,16 @@ def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
         others = (OURS,) if iterations.get(OURS) not in (None, count) else ()
         asked = settings.equal_iterations or others
         names = tuple(name for name in asked if name != NONE)
-        found.append(Condition(EQUAL, names, {"budget": {"iterations": count}}))
-    found = [condition for condition in found if condition.methods]
-    estimated = [condition for condition in found if condition.clip and OURS in condition.methods]
+        conditions.append(Condition(EQUAL, names, {"budget": {"iterations": count}}))
+    conditions = [condition for condition in conditions if condition.methods]
+    estimated = [condition for condition in conditions if condition.clip and OURS in condition.methods]
     ours = {name: spec for name, spec in specs.items() if name == OURS}
     crossed = _ablations("--tracked-ablations", settings.tracked_ablations, ours)
     if crossed and not estimated:
         expected = f"{OURS} among those of --tracked, which --tracked-ablations are compared with"
         raise InputError("command line", "--tracked", expected, " ".join(tracked) or NONE)
     return [
-        *found,
+        *conditions,
         *_ablations("--ablations", settings.ablations, specs),
         *(
             replace(ablation, name=f"{ablation.name}-{condition.name}", clip=condition.clip)
@@ -270,12 +273,16 @@ def _ablations(option: str, asked: Sequence[str], specs: dict[str, MethodSpec]) 
     if ALL in asked and OURS not in specs:
         expected = f"{OURS} among them, whose {option} are all"
         raise InputError("command line", "--methods", expected, ", ".join(specs))
-    known: dict[str, Condition] = {}
+    conditions: dict[str, Condition] = {}
     for spec in sorted(specs.values(), key=lambda spec: spec.name == OURS):
-        known |= {name: Condition(name, (spec.name,), dict(own)) for name, own in spec.ablations.items()}
+        conditions |= {
+            name: Condition(name, (spec.name,), dict(changes)) for name, changes in spec.ablations.items()
+        }
     for name in asked:
-        if name not in (*known, ALL):
-            raise InputError("command line", option, f"{', '.join(known)} or {ALL}", name)
+        if name not in (*conditions, ALL):
+            raise InputError("command line", option, f"{', '.join(conditions)} or {ALL}", name)
     return [
-        each for name, each in known.items() if name in asked or (ALL in asked and each.methods == (OURS,))
+        each
+        for name, each in conditions.items()
+        if name in asked or (ALL in asked and each.methods == (OURS,))
     ]

@@ -194,9 +194,9 @@ class TruthJudge:
         }
         for region, pixels in ((FULL, np.ones_like(truth.face)), (FACE, truth.face)):
             left, top, width, height = cv2.boundingRect(pixels.astype(np.uint8))
-            part = np.s_[top : top + height, left : left + width]
+            crop = np.s_[top : top + height, left : left + width]
             try:
-                scores["lpips", region] = self._lpips(picture[part], truth.rgb[part]) if width else NO_FACE
+                scores["lpips", region] = self._lpips(picture[crop], truth.rgb[crop]) if width else NO_FACE
             except UnavailableError as error:
                 scores["lpips", region] = error.note
         return scores

@@ -218,13 +218,13 @@ class Baseline:
             remedy = "Install what is missing, or delete the number from the baseline."
             reason = results.unavailable[lost[0]]
             raise InputError(results.source, str(lost[0]), "a number, as in the baseline", reason, remedy)
-        known = earlier.tolerances if earlier else {}
+        tolerances = earlier.tolerances if earlier else {}
         metrics = sorted({place.metric for place in results.values})
         return cls(
             captures or (earlier.captures if earlier else "same"),
             dict(results.environment),
             dict(results.protocols),
-            {name: known.get(name) or Tolerance.default(results.metrics[name]) for name in metrics},
+            {name: tolerances.get(name) or Tolerance.default(results.metrics[name]) for name in metrics},
             dict(sorted(results.values.items())),
             dict(sorted(results.frames.items())),
             dict(sorted(results.unavailable.items())),

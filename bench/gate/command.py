@@ -75,23 +75,23 @@ def judge(results: Results, baseline: Baseline, *, speed: bool = False) -> list[
     verdicts = []
     for place, expected in baseline.values.items():
         tolerance = baseline.tolerances[place.metric]
-        found = results.values.get(place)
+        value = results.values.get(place)
         outcome: Outcome = "missing"
         reason = other.get(place.task, "")
         if tolerance.machine_bound and not speed:
             outcome, reason = "unjudged", NOT_JUDGED
         elif reason:
-            found = None
-        elif found is None:
-            known = results.problems.get(place) or results.unavailable.get(place)
-            reason = known or "no rows; was it measured?"
+            value = None
+        elif value is None:
+            excuse = results.problems.get(place) or results.unavailable.get(place)
+            reason = excuse or "no rows; was it measured?"
         elif results.frames[place] < baseline.frames[place]:
-            found, reason = None, f"{results.frames[place]} frames, {baseline.frames[place]} in the baseline"
+            value, reason = None, f"{results.frames[place]} frames, {baseline.frames[place]} in the baseline"
         elif tolerance.machine_bound and not same_machine:
             outcome, reason = "unjudged", "measured on another machine"
         else:
-            outcome = _outcome(found, expected, tolerance)
-        verdicts.append(Verdict(place, outcome, found, expected, tolerance, reason))
+            outcome = _outcome(value, expected, tolerance)
+        verdicts.append(Verdict(place, outcome, value, expected, tolerance, reason))
     unavailable = {p: r for p, r in results.unavailable.items() if p not in baseline.unavailable}
     lacking = {**results.problems, **unavailable}
     for place in {**results.values, **lacking}.keys() - baseline.values.keys():
@@ -143,15 +143,15 @@ def _other_protocols(results: Results, baseline: Baseline) -> dict[str, str]:
     """Tasks measured by another protocol than the baseline's, and the difference."""
     other = {}
     for task, expected in baseline.protocols.items():
-        found = results.protocols.get(task)
-        if found is None:
+        measured = results.protocols.get(task)
+        if measured is None:
             continue  # its numbers are missing one by one
-        agrees = found.hash == expected.hash
+        agrees = measured.hash == expected.hash
         if baseline.captures == "remade":
-            agrees = found.design == expected.design
+            agrees = measured.design == expected.design
         if not agrees:
-            what = "other captures" if found.design == expected.design else "other frames or settings"
-            other[task] = f"protocol {found.hash}, the baseline's is {expected.hash}: {what}"
+            what = "other captures" if measured.design == expected.design else "other frames or settings"
+            other[task] = f"protocol {measured.hash}, the baseline's is {expected.hash}: {what}"
     return other
 
 
@@ -172,8 +172,8 @@ def unjudged_notes(verdicts: Sequence[Verdict]) -> list[str]:
         if verdict.outcome == "unjudged":
             places.setdefault(verdict.reason, []).append(verdict.place)
     return [
-        f"Not judged, {len(own)} numbers of {', '.join(sorted({place.metric for place in own}))}: {reason}."
-        for reason, own in places.items()
+        f"Not judged, {len(group)} numbers of {', '.join(sorted({place.metric for place in group}))}: {reason}."
+        for reason, group in places.items()
     ]
 
 
@@ -214,13 +214,13 @@ def to_junit(verdicts: Sequence[Verdict], notes: Sequence[str]) -> str:
     """JUnit XML with a suite for each task: regressed is a failure, missing an error, unjudged skipped."""
     root = ElementTree.Element("testsuites", name="headbench compare", time="0")
     for task in dict.fromkeys(verdict.place.task for verdict in verdicts):
-        own = [verdict for verdict in verdicts if verdict.place.task == task]
-        counts = Counter(verdict.outcome for verdict in own)
-        numbers = {"tests": len(own), "failures": counts["regressed"]}
+        of_task = [verdict for verdict in verdicts if verdict.place.task == task]
+        counts = Counter(verdict.outcome for verdict in of_task)
+        numbers = {"tests": len(of_task), "failures": counts["regressed"]}
         numbers |= {"errors": counts["missing"], "skipped": counts["unjudged"], "time": 0}
         attributes = {"name": _xml(task), **{name: str(number) for name, number in numbers.items()}}
         suite = ElementTree.SubElement(root, "testsuite", attributes)
-        for verdict in own:
+        for verdict in of_task:
             place = verdict.place
             name = _xml(f"{place.metric} {place.region} subject {place.subject}")
             case = ElementTree.SubElement(

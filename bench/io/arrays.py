@@ -91,13 +91,13 @@ class _Sparse:
         """(rows, columns) array; entries at the same place add up."""
         import scipy.sparse
 
-        own = vars(self)
+        arrays = vars(self)
         if self.layout == "coo":
-            places = own.get("coords") or (own["row"], own["col"])  # since scipy 1.11, before
-            parts: Any = (own["data"], places)
+            places = arrays.get("coords") or (arrays["row"], arrays["col"])  # since scipy 1.11, before
+            parts: Any = (arrays["data"], places)
         else:
-            parts = own["data"], own["indices"], own["indptr"]
-        matrix = getattr(scipy.sparse, f"{self.layout}_matrix")(parts, own["_shape"])
+            parts = arrays["data"], arrays["indices"], arrays["indptr"]
+        matrix = getattr(scipy.sparse, f"{self.layout}_matrix")(parts, arrays["_shape"])
         if self.layout != "coo":
             matrix.check_format(full_check=True)
         return np.asarray(matrix.toarray())
@@ -242,14 +242,14 @@ def check_arrays(
     sizes: Mapping[str, int] | None = None,
 ) -> dict[str, int]:
     """Check arrays by name; return the sizes of the named axes."""
-    known = dict(sizes or {})
+    lengths = dict(sizes or {})
     for name, member in members.items():
         if name in content:
-            _check(path, name, content[name], member, known)
+            _check(path, name, content[name], member, lengths)
         elif not member.optional:
             found = f"only {', '.join(sorted(content))}"[:400]
             raise InputError(path, name, "an array of that name", found)
-    return known
+    return lengths
 
 
 def check_numbers(
@@ -285,8 +285,8 @@ def _check(
         wanted = [sizes.get(size) if isinstance(size, str) else size for size in member.shape]
         fits = len(wanted) == values.ndim and all(w in (None, n) for w, n in zip(wanted, values.shape))
         if fits:
-            for size, found in zip(member.shape, values.shape):
-                fits = fits and (not isinstance(size, str) or sizes.setdefault(size, found) == found)
+            for size, length in zip(member.shape, values.shape):
+                fits = fits and (not isinstance(size, str) or sizes.setdefault(size, length) == length)
         if not fits:
             named = [str(w if w is not None else s or "any") for w, s in zip(wanted, member.shape)]
             comma = "," * (len(named) == 1)

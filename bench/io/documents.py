@@ -83,15 +83,15 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
         for name_node, _ in node.value:
-            name, found = self.construct_object(name_node, deep=True), ""
+            name, fault = self.construct_object(name_node, deep=True), ""
             if not isinstance(name, (str, int)) or isinstance(name, bool):
-                found = (
+                fault = (
                     f"{shown(name)} as a key, which has to be text, in quotes where YAML takes it otherwise,"
                 )
             elif str(name) in seen:  # 5 and "5" are the same key in JSON
-                found = f"the key {_REPR.repr(name)} again"
-            if found:
-                raise yaml.constructor.ConstructorError(None, None, found, name_node.start_mark)
+                fault = f"the key {_REPR.repr(name)} again"
+            if fault:
+                raise yaml.constructor.ConstructorError(None, None, fault, name_node.start_mark)
             seen.add(str(name))
         return dict(super().construct_mapping(node, deep=deep))
 
@@ -314,10 +314,10 @@ def _refuse(errors: Sequence[Any], kind: Any, source: Source, prefix: str) -> No
         error = max(errors, key=lambda each: len(each["loc"]))
     else:
         errors = errors[:1]
-    place = [part for part in error["loc"] if part not in ("[key]", _CHOICE)]
+    place = [entry for entry in error["loc"] if entry not in ("[key]", _CHOICE)]
     key = prefix.rstrip(".")
-    for part in place:
-        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else part
+    for entry in place:
+        key += f"[{entry}]" if isinstance(entry, int) else f".{entry}" if key else entry
     if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
         raise unknown(str(source), key, str(place[-1]), _entries(kind, place[:-1]))
     names = re.findall(r"'([^']*)'", error["ctx"]["expected"]) if error["type"] == "literal_error" else ()

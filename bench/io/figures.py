@@ -19,8 +19,8 @@ LONGEST = 2**16 - 1
 
 def drawable(text: str, font: FontProperties | None = None) -> str:
     """The text, with code points such as U+5F20 for characters that a font lacks; by default matplotlib's."""
-    known = _characters(findfont(font or FontProperties()))
-    written = "".join(c if ord(c) in known or c == "\n" else f"U+{ord(c):04X}" for c in text)
+    drawn = _characters(findfont(font or FontProperties()))
+    written = "".join(c if ord(c) in drawn or c == "\n" else f"U+{ord(c):04X}" for c in text)
     return re.sub(r"(U\+[0-9A-F]{4,6})(?=U\+)", r"\1 ", written)
 
 

@@ -95,10 +95,10 @@ def check_inside(folder: Path) -> None:
     given = os.path.abspath(folder)
     for root in _roots:
         if _below(given, os.path.abspath(root)):
-            found = os.path.realpath(given)
-            if not _below(found, os.path.realpath(root)):
+            real = os.path.realpath(given)
+            if not _below(real, os.path.realpath(root)):
                 remedy = "Remove the link; nothing is written outside of the output folder."
-                raise InputError(folder, "", f"a folder inside {root}", f"a link to {found}", remedy)
+                raise InputError(folder, "", f"a folder inside {root}", f"a link to {real}", remedy)
 
 
 def refuse_links(folder: Path) -> None:
@@ -223,11 +223,11 @@ def check_kind(folder: Path, *kinds: str) -> None:
 @contextmanager
 def removed_if_empty(folder: Path) -> Iterator[None]:
     """At the end of the block, remove the folder and its parents if the block created them and they are empty."""
-    made = list(takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
+    created = list(takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
     try:
         yield
     finally:
-        for path in made:
+        for path in created:
             with suppress(OSError):
                 path.rmdir()
 
@@ -369,8 +369,8 @@ def entries(folder: Path, pattern: str = "*") -> list[Path]:
 def user_files(folder: Path, pattern: str = "*") -> list[Path]:
     """As `entries`, including hidden files except those of interrupted writes: existing content that a command must
     keep separate."""
-    found = sorted(path for path in folder.glob(pattern) if not is_system_file(path.name))
-    return [path for path in found if not path.name.startswith(TEMPORARY)]
+    files = sorted(path for path in folder.glob(pattern) if not is_system_file(path.name))
+    return [path for path in files if not path.name.startswith(TEMPORARY)]
 
 
 def expand_home(text: str, source: str) -> str:

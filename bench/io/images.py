@@ -94,16 +94,16 @@ def ffmpeg() -> str:
 
     Raises `UnavailableError` if neither is found.
     """
-    found = shutil.which("ffmpeg")
-    if found is None:
+    program = shutil.which("ffmpeg")
+    if program is None:
         try:
-            found = str(importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe())
+            program = str(importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe())
         except (ImportError, RuntimeError):
             remedy = "Install it: apt-get install ffmpeg, or pip install imageio-ffmpeg."
             raise UnavailableError(
                 "H.264 is encoded by the program ffmpeg, which is not here.", remedy
             ) from None
-    return found
+    return program
 
 
 def encode_h264(path: Path, frames: Iterable[ByteArray], size: tuple[int, int], fps: float, crf: int) -> None:

@@ -6,8 +6,7 @@ import pytest
 
 from headbench.bench import registry
 from headbench.bench.errors import HeadbenchError, InputError
-from headbench.bench.registry import is_outside
-from headbench.bench.source import code_digest, forget_code
+from headbench.bench.registry import code_digest, forget_code, is_outside
 from headbench.bench.specs import MetricSpec, ProfileSpec
 
 FILE = {"plug.py": "class M: pass", "beside.py": "", "further/near.py": "", "notes.txt": ""}

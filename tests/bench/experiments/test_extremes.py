@@ -31,7 +31,6 @@ from headbench.bench.io.lock import locked
 from headbench.bench.registry import get
 from headbench.reports.contact_sheet import BROKEN, EXTRAPOLATED, SHEET_FILE
 
-pytestmark = pytest.mark.usefixtures("no_sheets")
 CELLS = {
     f"{subject}/{method}/seed-0" for subject in ("ball-a", "ball-bee") for method in ("bursting", "listed")
 }
@@ -58,6 +57,7 @@ def renders(balls, monkeypatch):
     return done
 
 
+@pytest.mark.usefixtures("no_sheets")
 @pytest.mark.commands
 def test_worker_processes_leave_the_same(ball_run):
     folder = ball_run("BURSTING", "LISTED")
@@ -71,6 +71,7 @@ def test_worker_processes_leave_the_same(ball_run):
             assert path.read_bytes().replace(b"inline", b"tasks") == left[1][name].read_bytes(), name
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_what_is_done_is_kept(ball_run, command, renders):
     folder = ball_run("BALL")
     out = folder / "out"
@@ -81,6 +82,7 @@ def test_what_is_done_is_kept(ball_run, command, renders):
     assert (out / "rows.parquet").read_bytes() == before
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_an_avatar_that_fails_is_recorded_and_the_others_go_on(ball_run, command, balls, monkeypatch):
     folder = ball_run("BALL", "SPLATTY")
 
@@ -160,6 +162,7 @@ def test_a_stable_avatar_passes_and_what_has_no_truth_is_missing(ball_run):
     assert not (folder / "extremes" / "truth").exists()
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_avatars_that_render_lists_alone_are_missing(ball_run):
     folder = ball_run("LISTED")
     found = extremes_run(settings(folder))
@@ -171,6 +174,7 @@ def test_avatars_that_render_lists_alone_are_missing(ball_run):
     assert set(missing["metric"]) == {metric.name for metric in (*STABILITY, *AGAINST_TRUTH)}
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_a_burst_where_jaw_and_expression_act_together_is_found(ball_run, balls, tmp_path):
     folder = ball_run("BURSTING", "BALL")
     found = extremes_run(settings(folder))
@@ -213,6 +217,7 @@ def test_splats_that_grow_and_values_not_finite_are_found(ball_run, balls, tmp_p
     assert "typical_turntable-00.png" in written
 
 
+@pytest.mark.usefixtures("no_sheets")
 def test_what_is_not_there_is_refused_before_any_work(ball_run, run_of, tmp_path):
     folder, floor = ball_run("BALL", "FLOOR"), run_of("ball_plugin:FLOOR", folder=tmp_path / "floor")
     (tmp_path / "moved" / "ball-other").mkdir(parents=True)
