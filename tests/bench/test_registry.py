@@ -58,7 +58,7 @@ def test_an_edit_counts_in_each_file_of_the_code(write, files, reference, counte
 
 
 def test_code_of_this_package_is_the_folder_of_the_module():
-    ga, config = (code_digest(f"headbench.methods.ga.{name}") for name in ("spec:GA", "config:GAConfig"))
+    ga, config = (code_digest(f"headbench.methods.ga.{name}") for name in ("spec:GA", "method:GAAppearance"))
     assert ga == config != code_digest("headbench.methods.gbs.spec:GBS")
     assert [is_outside(f"{name}:X") for name in ("headbench.methods.ga.spec", "toy")] == [False, True]
 

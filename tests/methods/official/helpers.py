@@ -9,8 +9,7 @@ from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.engine.scoring import TrainingView
 from headbench.bench.io.arrays import check_arrays
 from headbench.datasets.head.model import PosedSubject
-from headbench.datasets.nersemble.benchmark.submission import MEMBERS
-from headbench.datasets.tracker_files.formats import metrical_frame
+from headbench.datasets.tracker_files.formats import METRICAL_MEMBERS, metrical_frame
 from headbench.methods.official.workplace import Workplace
 
 BUDGET = Budget(iterations=20)
@@ -73,7 +72,7 @@ def read_tracked(path):
         content = torch.load(path, weights_only=True)
     arrays = {f"{part}.{k}": array for part in ("flame", "opencv") for k, array in content[part].items()}
     arrays["img_size"] = content["img_size"][::-1]
-    check_arrays(path, arrays, MEMBERS)
+    check_arrays(path, arrays, METRICAL_MEMBERS)
     return metrical_frame(path, int(path.stem), arrays)
 
 
