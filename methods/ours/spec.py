@@ -223,15 +223,12 @@ def _with_additions(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 PAPER: dict[str, Any] = {"planes": {"bounds_variant": "paper"}}
 PRESETS = splat_presets(SHORT, PAPER, quick=390, fast=2_050)
-for _name in ("demo", "fast"):
-    # Faster, the colour network learns the directions of the training cameras by heart (docs/explanation/methods/ours.md).
-    PRESETS[_name]["planes"] = {**SHORT["planes"], "network_lr": 3e-4}
 
 OURS = MethodSpec(
     name="ours",
     default=True,
     demo=True,
-    version="6",
+    version="5",
     summary="Mesh-bound splats with tri-plane colour and expression-driven opacity along feature lines.",
     implementation="headbench.methods.ours.method:Ours",
     config="headbench.methods.ours.spec:OursConfig",

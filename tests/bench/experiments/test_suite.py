@@ -146,10 +146,7 @@ def test_ablations_change_ours_and_additions_make_ours_plus():
     for preset in OURS.presets:
         plain = resolve_method(OURS, preset, {}).config
         assert all(resolve_method(OURS, preset, each).config != plain for each in OURS.ablations.values())
-        planes = resolve_method(OURS_PLUS, preset, {}).config.planes  # its network has a rate of its own
-        rate = {"planes": {"network_lr": planes.network_lr}}
-        added = resolve_method(OURS, preset, merge(additions, rate))
-        assert added.config == resolve_method(OURS_PLUS, preset, {}).config
+        assert resolve_method(OURS, preset, additions).config == resolve_method(OURS_PLUS, preset, {}).config
 
 
 @pytest.mark.parametrize(
