@@ -109,10 +109,10 @@ def _measure(settings: StressSettings, kind: str, progress: Progress) -> Command
         raise InputError("command line", "part", f"a benchmark with {kind}", found)
     if settings.out is not None:
         check_writable(Path(settings.out), "--out")
-    findings: CommandResult = resolve(function)(settings.quick, progress)
+    result: CommandResult = resolve(function)(settings.quick, progress)
     if settings.out is not None:
-        write_json(Path(settings.out), findings.data)
-    return findings
+        write_json(Path(settings.out), result.data)
+    return result
 
 
 State = Literal["ready", "partly", "missing"]

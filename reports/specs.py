@@ -42,31 +42,3 @@ PAGE = ReportSpec(
     summary="One HTML file with tables, frames of all methods side by side, curves and the record of the run.",
     implementation="headbench.reports.page.report:write_page",
 )
-
-CURVE_REPORT = ReportSpec(
-    name="curve",
-    summary="Quality against training time, cameras, timesteps, images or tracking error, as a table, CSV and a plot.",
-    implementation="headbench.reports.curve.curve:curve_report",
-    writes=False,
-)
-
-PARETO_REPORT = ReportSpec(
-    name="pareto",
-    summary="Quality over size and frame time with the Pareto front, as a table, CSV and a plot.",
-    implementation="headbench.reports.pareto.command:pareto",
-    writes=False,
-)
-
-SUITE_REPORT = ReportSpec(
-    name="suite",
-    summary="Results of the suite by region and sequence, with differences from a method, tracking from images and ablations.",
-    implementation="headbench.reports.suite.suite:suite_report",
-    writes=False,
-)
-
-ROBUSTNESS = ReportSpec(
-    name="robustness",
-    summary="Contact sheet and summary of the output of `run extremes` and `run reenact`.",
-    implementation="headbench.reports.contact_sheet:robustness_report",
-    writes=False,
-)
