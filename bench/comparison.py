@@ -40,7 +40,7 @@ from .io.files import (
 )
 from .io.lock import locked
 from .listing import presets_of_methods
-from .machine import check_device, processor_count
+from .machine import check_device
 from .progress import counted, log_to_file
 from .progress import progress as show_progress
 from .protocol import check_capture, needed
@@ -88,10 +88,7 @@ ONE_SUBJECT = (
 
 @command("demo", group="compare")
 def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
-    """Compare all methods on a synthetic capture; needs no data, GPU or network.
-
-    With the preset "quick", avatars are trained beside each other, with one thread each: a training keeps about 1.2 of 2 cores busy.
-    """
+    """Compare all methods on a synthetic capture; needs no data, GPU or network."""
     from .engine.run import run as run_comparison  # slow to import
 
     values = parse_assignments(settings.set)
@@ -112,7 +109,6 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
     arguments, out = config.capture_arguments(), Path(settings.out)
     check_kind(out, "a run")
     check_output_folder(out)
-    beside = is_quick and comparison.device == "cpu" and processor_count() > 1
     with _log_file(out):
         log.info(
             "Renders images of a synthetic head, trains %s on a part of them, and compares their renders with the other images. Takes %s on "
@@ -126,9 +122,8 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
         with locked(out), show_progress("images of the capture") as report:
             make = resolve(get("datasets", "synthetic").implementation)
             make(**arguments, progress=report)
-        execution = Execution("processes") if beside else None
         seconds = round(time.perf_counter() - start, 3)
-        result = _result(run_comparison(comparison, execution, capture_seconds=seconds))
+        result = _result(run_comparison(comparison, Execution("auto"), capture_seconds=seconds))
     return result._replace(text=f"{result.text}\n{ONE_SUBJECT}")
 
 
@@ -166,7 +161,8 @@ class RunSettings:
     """Seeds of the training, separated by commas: an avatar is trained for each. Default: 0."""
     executor: ExecutorName | None = None
     """How cells (a subject, a method, a seed) are executed: inline, one after another; processes, several at once on this
-    machine; slurm, one job for each. Default: inline."""
+    machine; slurm, one job for each; auto, processes for several trainings on a CPU with several cores and 2 GB of free memory
+    for each, otherwise inline. Default: auto."""
     workers: int | None = None
     """Number of processes, with `--executor processes`. Default: one for each core."""
     unchecked: bool = False

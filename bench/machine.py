@@ -73,19 +73,25 @@ def _cgroup_limits(controller: str, *names: str) -> Iterator[list[str]]:
                 yield words
 
 
+def memory() -> tuple[int, int]:
+    """Memory of this machine in bytes, whole and available, within the limits of cgroups."""
+    import psutil
+
+    limits = [int(words[0]) for words in _cgroup_limits("memory", "memory.max", "memory.limit_in_bytes")]
+    whole = psutil.virtual_memory()
+    return min([whole.total, *limits]), min([whole.available, *limits])
+
+
 def machine_record(device: str = "cpu") -> dict[str, Any]:
     """Processor, memory and cores within the limits of cgroups, system, the versions of packages that influence results, and headbench's git commit, if any.
 
     For a CUDA ``device`` the entry "device" has its name, memory, compute capability, the CUDA version of
     torch, and whether matrix products and convolutions may round to TF32.
     """
-    import psutil
-
-    limits = (int(words[0]) for words in _cgroup_limits("memory", "memory.max", "memory.limit_in_bytes"))
     return {
         "processor": _processor(),
         "cores": processor_capacity(),
-        "memory_bytes": min([psutil.virtual_memory().total, *limits]),
+        "memory_bytes": memory()[0],
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in RECORDED_PACKAGES},

@@ -227,7 +227,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
 
     The text is the table, together with the run named by ``like``.
     """
-    if settings.execution.executor != "inline":
+    if settings.execution.executor in ("processes", "slurm"):
         out = Path(settings.out)
         place = out.with_name(f"{out.name}-task")
         return run_as_task(f"{__name__}:evaluate_folder", settings, place, settings.device)

@@ -26,7 +26,13 @@ from ..executors.settings import Execution, check_executor
 from ..executors.task import FULL_DISK, Task, read_outcome
 from ..io.files import check_kind, check_output_folder
 from ..io.lock import locked
-from ..machine import check_device, check_device_answers, peak_memory_bytes
+from ..machine import (
+    check_device,
+    check_device_answers,
+    memory,
+    peak_memory_bytes,
+    processor_count,
+)
 from ..progress import Position, RunProgress, counted, duration, run_progress
 from ..protocol import TASK_TITLES, Protocol, missing_tasks
 from ..registry import discover, get, resolve
@@ -39,6 +45,8 @@ from .plan import Job, Plan, make_jobs, make_plan
 from .scoring import compared_over_time, make_metric
 from .store import FinishedRun, RunFolder
 
+WORKER_BYTES = 2_000_000_000
+"""Memory that a worker may need, for the executor ``auto``."""
 log = logging.getLogger(__name__)
 RunCell = Callable[[Job, Sequence[MetricSpec]], Rows]
 REPORT_EVERY_S, LOG_EVERY_S = 2.0, 10.0
@@ -100,6 +108,7 @@ def run(
         manifest = replace(plan.manifest, unchecked=unchecked or None, **record)
         manifest.write(folder.manifest)
         parts = []
+        execution = chosen(execution, plan)
         if execution.executor == "inline":
             with run_progress({job.name: job.steps(metrics) for job in jobs}) as line:
                 for job in jobs:
@@ -227,6 +236,18 @@ def check_capture(config: RunConfig, clip: Clip) -> None:
             + (f"; and {counted(len(errors) - 1, 'other error')}" if errors[1:] else ""),
             "`headbench lint` shows more; `headbench run --unchecked` trains all the same.",
         )
+
+
+def chosen(execution: Execution, plan: Plan) -> Execution:
+    """Replace the executor ``auto``: a training keeps little more than one core busy, so several are executed beside each other."""
+    if execution.executor != "auto":
+        return execution
+    trainings = [j for j in plan.jobs if not (j.source or j.method.spec.trivial or j.cell.is_trained)]
+    possible = min(processor_count(), len(trainings), memory()[1] // WORKER_BYTES)
+    workers = min(execution.workers or possible, possible)
+    if plan.config.device != "cpu" or workers < 2:
+        return replace(execution, executor="inline")
+    return replace(execution, executor="processes", workers=workers)
 
 
 def execute(plan: Plan, execution: Execution) -> list[Rows]:

@@ -17,7 +17,7 @@ from ..options import DependentOptions, check_dependent
 from ..process import environment_variable
 from ..registry import unknown
 
-ExecutorName = Literal["inline", "processes", "slurm"]
+ExecutorName = Literal["auto", "inline", "processes", "slurm"]
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,8 @@ class Execution:
     """How the cells of a run are executed. None of these settings enters a fingerprint."""
 
     executor: ExecutorName = "inline"
-    """``inline``, sequentially in this process; ``processes``, in parallel on this machine; ``slurm``, one job per cell."""
+    """``inline``, sequentially in this process; ``processes``, in parallel on this machine; ``slurm``, one job per cell; ``auto``,
+    ``processes`` for several trainings on the CPU of a machine with several cores and memory for them, otherwise ``inline``."""
     workers: int | None = None
     """Number of ``processes``; None: one for each core."""
     threads: int | None = None
@@ -102,8 +103,8 @@ def check_executor(execution: Execution, device: str) -> None:
 
 
 DEPENDENT = (
-    DependentOptions(("workers", "threads"), "executor", ("processes",)),
-    DependentOptions(("restarts",), "executor", ("processes", "slurm")),
+    DependentOptions(("workers", "threads"), "executor", ("auto", "processes")),
+    DependentOptions(("restarts",), "executor", ("auto", "processes", "slurm")),
     DependentOptions(("poll_s", "slurm"), "executor", ("slurm",)),
 )
 """Settings of `Execution` that apply to some executors only."""
@@ -116,7 +117,7 @@ def chosen_execution(
     workers: int | None,
     source: str,
 ) -> Execution:
-    """Settings of an executor, overridden by ``--set`` and by the options ``--executor`` and ``--workers``.
+    """Settings of an executor, overridden by ``--set`` and by the options ``--executor`` and ``--workers``; by default ``auto``.
 
     Parameters
     ----------
@@ -132,7 +133,7 @@ def chosen_execution(
     options = {"executor": executor, "workers": workers}
     options = {key: value for key, value in options.items() if value is not None}
     # `build` refuses other values.
-    values = merge(settings, options) if isinstance(settings, Mapping) else settings
+    values = merge(merge({"executor": "auto"}, settings), options) if isinstance(settings, Mapping) else settings
     execution = build(Execution, values, source, "execution.")
     given = {key: f"--set execution.{key}" for key in assigned} | {key: f"--{key}" for key in options}
     check_dependent(DEPENDENT, execution, given)
@@ -143,7 +144,7 @@ def chosen_execution(
 class ExecutionOptions:
     """How a command is executed."""
 
-    executor: ExecutorName = "inline"
+    executor: ExecutorName | None = None
     """Executor, as for `headbench run`."""
 
     workers: int | None = None
@@ -160,9 +161,8 @@ class ExecutionOptions:
         given = parse_assignments(self.set)
         if stray := sorted(given.keys() - {"execution"}):
             raise unknown("command line", "--set", stray[0], ["execution"])
-        executor = None if self.executor == "inline" else self.executor
         settings = given.get("execution", {})
-        return chosen_execution(settings, settings, executor, self.workers, "command line")
+        return chosen_execution(settings, settings, self.executor, self.workers, "command line")
 
     @property
     def others(self) -> dict[str, Any]:

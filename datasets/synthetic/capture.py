@@ -176,7 +176,7 @@ def synthesize(
     total = len(plans) * timesteps * cameras
     done = 0
     progress(done, total)
-    if execution is not None and execution.executor != "inline":
+    if execution is not None and execution.executor in ("processes", "slurm"):
         _run_all(out, plans, execution)
     for plan in plans:
         work = _left(plan)
