@@ -25,7 +25,7 @@ from torch import Tensor
 from ...bench.contracts import Camera, Clip, FloatArray, HeadAsset, HeadPose
 from ...bench.errors import InputError
 from ...bench.native.dispatch import to_device
-from .rotations import axis_angle_to_matrix
+from .rotations import axis_angle_to_matrix, rotation_of
 
 
 class HeadModel(torch.nn.Module):
@@ -41,8 +41,7 @@ class HeadModel(torch.nn.Module):
     template: Tensor
     faces: Tensor
     shape_matrix: Tensor
-    expression_matrix: Tensor
-    pose_matrix: Tensor
+    blend_matrix: Tensor
     joint_regressor: Tensor
     joint_matrix: Tensor
     skinning_weights: Tensor
@@ -66,16 +65,20 @@ class HeadModel(torch.nn.Module):
 
         buffer("template", asset.template)
         basis("shape_matrix", asset.shape_basis)
-        basis("expression_matrix", asset.expression_basis)
-        basis("pose_matrix", asset.pose_basis)
+        basis("blend_matrix", np.concatenate([asset.expression_basis, asset.pose_basis], axis=2))
         buffer("joint_regressor", asset.joint_regressor)
         buffer("skinning_weights", asset.skinning_weights)
         if asset.eyelid_basis is None:
             self.eyelid_matrix = None
         else:
             basis("eyelid_matrix", asset.eyelid_basis)
+        self.expression_size = np.shape(asset.expression_basis)[2]
+        """E, the number of expression coefficients."""
         regressor = np.asarray(asset.joint_regressor, np.float64)
-        basis("joint_matrix", np.tensordot(regressor, np.asarray(asset.expression_basis, np.float64), 1))
+        self._joint_basis: FloatArray = np.tensordot(
+            regressor, np.asarray(asset.expression_basis, np.float64), 1
+        )
+        basis("joint_matrix", self._joint_basis)
         faces = torch.tensor(np.asarray(asset.faces, dtype=np.int64), device=device)
         self.register_buffer("faces", faces, persistent=False)
 
@@ -85,9 +88,14 @@ class HeadModel(torch.nn.Module):
         return self.shape_matrix.shape[0]
 
     @property
-    def expression_size(self) -> int:
-        """E, the number of expression coefficients."""
-        return self.expression_matrix.shape[0]
+    def expression_matrix(self) -> Tensor:
+        """(E, 3 V) expression basis."""
+        return self.blend_matrix[: self.expression_size]
+
+    @property
+    def pose_matrix(self) -> Tensor:
+        """(9 (J - 1), 3 V) basis of the pose correctives."""
+        return self.blend_matrix[self.expression_size :]
 
     def forward(
         self,
@@ -144,6 +152,35 @@ class HeadModel(torch.nn.Module):
                 raise ValueError(f"head model {self.version!r} has no eyelid basis, but eyelids were given")
             lids = (_rows(eyelids, 2, "eyelids") @ self.eyelid_matrix).unflatten(1, (-1, 3))
             vertices = vertices + lids @ (rotations[:, 0] @ rotations[:, 1]).mT
+        return vertices
+
+    @torch.no_grad()
+    def driven(self, neutral: Tensor, joints: FloatArray, pose: HeadPose) -> Tensor:
+        """Vertices of one pose as `forward` gives them, (V, 3), metres, without gradients.
+
+        Joints are moved on the host in float64: their many small operations take most of the time of `forward`, above all on a GPU.
+
+        ``neutral``: (V, 3) result of `canonical`. ``joints``: (J, 3) its rest positions.
+        """
+        columns = {name: values[0] for name, values in self.pose_columns([pose]).items()}
+        angles = np.concatenate([columns[name] for name in ("rotation", "neck", "jaw", "eyes")]).reshape(
+            -1, 3
+        )
+        rotations = torch.from_numpy(rotation_of(angles).as_matrix())[None]
+        rest = torch.from_numpy(joints + self._joint_basis @ columns["expression"])[None]
+        motions = joint_motions(rotations, rest, self.parents)
+        values = [torch.from_numpy(columns["expression"]), pose_feature(rotations)[0], motions.flatten()]
+        values += [torch.from_numpy(columns[name]) for name in ("translation", "eyelids") if name in columns]
+        packed = to_device(
+            torch.cat([*values, motions[0, 1, :, :3].T.flatten()]).to(neutral.dtype), neutral.device
+        )
+        sizes = [len(self.blend_matrix), motions.numel(), 3, *[2] * (self.eyelid_matrix is not None), 9]
+        blend, motion, translation, *lids, turn = packed.split(sizes)
+        shaped = torch.addmm(neutral.view(1, -1), blend[None], self.blend_matrix).view(-1, 3, 1)
+        blended = (self.skinning_weights @ motion.view(len(joints), 12)).view(-1, 3, 4)
+        vertices = torch.baddbmm(blended[:, :, 3:], blended[:, :, :3], shaped)[:, :, 0] + translation
+        if self.eyelid_matrix is not None:
+            vertices = vertices + (lids[0] @ self.eyelid_matrix).view(-1, 3) @ turn.view(3, 3)
         return vertices
 
     def canonical(self, shape: Tensor, static_offset: Tensor | None = None) -> Tensor:

@@ -8,6 +8,8 @@ and derivatives of any order keep full precision there.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
@@ -15,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ...bench.contracts import FloatArray
+from ...bench.native.dispatch import to_device
 
 # Below this squared argument the series is used. Five terms leave a truncation error under 3e-15; above it
 # the derivative of the direct formula loses at most a factor 1/0.04 of the working precision.
@@ -97,32 +100,35 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
+@cache
+def _quaternion_products(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(16, 9) and (16, 1): the entries of 4 q q^T as a linear map of those of a rotation matrix, and the constants added to them."""
+    entries = torch.zeros(4, 4, 3, 3, dtype=dtype)
+    for axis in range(3):
+        following, last = (axis + 1) % 3, (axis + 2) % 3
+        for row in range(4):
+            entries[row, row, axis, axis] = 1 if row in (0, axis + 1) else -1
+        for row, column, sign in ((0, axis + 1, -1), (following + 1, last + 1, 1)):
+            for first, second in ((row, column), (column, row)):
+                entries[first, second, last, following] = 1
+                entries[first, second, following, last] = sign
+    return to_device(entries.view(16, 9), device), to_device(torch.eye(4, dtype=dtype).view(16, 1), device)
+
+
 def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     """Unit quaternions (w, x, y, z), w >= 0, of rotation matrices. (..., 3, 3) to (..., 4).
 
     A rotation matrix gives all products of the quaternion's components, 4 q q^T, without a root. Its row with
     the largest diagonal has length at least 2, so normalising that row is well conditioned everywhere.
     """
-    # Separate contiguous components without a gather are several times faster than rows of four.
-    a, b, c, d, e, f, g, h, i = matrix.flatten(-2).movedim(-1, 0).contiguous().unbind(0)
-    x, y, z = h - f, c - g, d - b
-    p, q, r = b + d, c + g, f + h
-    diagonal = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
-    rows = (
-        (diagonal[0], x, y, z),
-        (x, diagonal[1], p, q),
-        (y, p, diagonal[2], r),
-        (z, q, r, diagonal[3]),
-    )
-    largest, row = diagonal[0], rows[0]
-    for value, other in zip(diagonal[1:], rows[1:]):
-        above = value > largest
-        row = tuple(torch.where(above, new, old) for new, old in zip(other, row))  # type: ignore[assignment]
-        largest = torch.where(above, value, largest)
-    chosen = torch.stack(row)
+    # Components are rows: sums over the first axis are several times faster on the CPU than those over columns of four.
+    linear, constant = _quaternion_products(matrix.dtype, matrix.device)
+    products = torch.addmm(constant, linear, matrix.reshape(-1, 9).t()).view(4, 4, -1)
     # The diagonal sums to 4, so its largest entry is at least 1 for any matrix, and there is no division by 0.
+    largest = products.diagonal().t().contiguous().max(0).indices
+    chosen = products.gather(0, largest.expand(1, 4, -1))[0]
     unit = chosen / chosen.square().sum(0).sqrt()
-    return torch.where(unit[:1] < 0, -unit, unit).movedim(0, -1).contiguous()
+    return torch.where(unit[:1] < 0, -unit, unit).t().contiguous().view(*matrix.shape[:-2], 4)
 
 
 _GENERATORS = np.array(

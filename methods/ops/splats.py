@@ -7,6 +7,7 @@ The frames of triangles are those of the code of Qian et al., "GaussianAvatars: 
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import normalize
 
-from ...bench.native.dispatch import Operation
+from ...bench.native.dispatch import Operation, to_device
 from ...datasets.head.rotations import matrix_to_quaternion
 from .kernel import KERNEL, call, empty_like
 
@@ -53,8 +54,8 @@ def triangle_frames(vertices: Tensor, faces: Tensor) -> TriangleFrames:
     side = corners[:, 2] - origin
     base_length = _length(base)
     along = base / base_length
-    normal = _unit(_cross(along, side))
-    across = -_unit(_cross(normal, along))
+    normal = _unit(torch.linalg.cross(along, side, dim=0))
+    across = -_unit(torch.linalg.cross(normal, along, dim=0))
     height = (across * side).sum(0).abs()
     rotation = torch.stack([along, normal, across], dim=1).permute(2, 0, 1).contiguous()
     size = 0.5 * (base_length + height)
@@ -122,12 +123,6 @@ def chart_axes(corners: Tensor, uv_edges: Tensor) -> Tensor:
     along = torch.linalg.solve(uv_edges, edges)
     normal = torch.linalg.cross(edges[:, 0], edges[:, 1])
     return torch.nn.functional.normalize(torch.stack([*along.unbind(1), normal], dim=2), dim=1)
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """Cross products of (3, F) vectors."""
-    (ax, ay, az), (bx, by, bz) = a.unbind(0), b.unbind(0)
-    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def _length(vectors: Tensor) -> Tensor:
@@ -310,11 +305,19 @@ def unturned(count: int) -> Tensor:
     return quats
 
 
+@cache
+def _product_matrix(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(4, 16): the entries of `left_products` for each component of a quaternion."""
+    entries = torch.zeros(4, 4, 4, dtype=dtype)
+    for row, columns in enumerate(["0 -1 -2 -3", "1 0 -3 2", "2 3 0 -1", "3 -2 1 0"]):
+        for column, entry in enumerate(columns.split()):
+            entries[abs(int(entry)), row, column] = -1 if entry.startswith("-") else 1
+    return to_device(entries.view(4, 16), device)
+
+
 def left_products(quaternions: Tensor) -> Tensor:
     """(F, 4, 4) matrices: ``left_products(q) @ p`` is the Hamilton product q p, real parts first."""
-    w, x, y, z = quaternions.unbind(1)
-    rows = [(w, -x, -y, -z), (x, w, -z, y), (y, z, w, -x), (z, -y, x, w)]
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+    return (quaternions @ _product_matrix(quaternions.dtype, quaternions.device)).view(-1, 4, 4)
 
 
 def apply_matrices(rows: Tensor, vectors: Tensor) -> Tensor:

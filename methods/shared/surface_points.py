@@ -39,6 +39,8 @@ class SubjectMesh:
         # Copies: a clip's arrays are read-only and shared by all methods.
         identity, offset = (torch.tensor(np.asarray(each)).to(like) for each in (shape, static_offset))
         self._canonical = self.model.canonical(identity, offset)
+        still = self._canonical.new_zeros(1, self.model.expression_size)
+        self._joints = self.model.rest_joints(self._canonical, still)[0].cpu().double().numpy()
         check_size(
             "subject", "shape, static_offset", self._canonical[0].cpu().numpy(), np.asarray(head.faces)
         )
@@ -73,7 +75,7 @@ class SubjectMesh:
     @torch.no_grad()
     def drive(self, pose: HeadPose) -> TriangleFrames:
         """Triangle frames of a pose in the world."""
-        return self.frames(self.posed(self.arguments([pose])))
+        return self.frames(self.model.driven(self.canonical, self._joints, pose))
 
 
 class TrainingPoses:

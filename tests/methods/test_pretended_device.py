@@ -23,6 +23,10 @@ def found(tmp_path_factory):
     return result_of("methods.pretended_trial", tmp_path_factory.mktemp("pretended"))
 
 
+OPERATIONS = {"flashavatar": 410, "ga": 70, "gbs": 290, "gha": 130, "ours": 105, "rgbavatar": 290}
+"""Operations of a frame without the rasteriser's, at most: a GPU spends several microseconds on the start of each."""
+
+
 # Adam turns rounding errors in gradients near 0 into steps of the learning rate, so the bound after training is not tighter;
 # rgbavatar has the highest rates.
 @pytest.mark.slow
@@ -32,7 +36,7 @@ def test_results_are_those_of_the_cpu_and_a_frame_waits_once(found, method):
     assert found[method]["difference"] < 1e-4
     assert found[method]["trained"] < (2e-2 if method == "rgbavatar" else 5e-3)
     assert found[method]["waits"] == 1
-    assert found[method]["operations"] > 0
+    assert 0 < found[method]["operations"] <= OPERATIONS[method]
 
 
 @pytest.mark.slow

@@ -156,6 +156,17 @@ def make_poses(head, count, seed=0):
     ]
 
 
+def test_driven_vertices_are_those_of_forward():
+    driving = pose(jaw=np.array([0.3, 0, 0.1]), eyelids=np.array([1.0, 0.5]))
+    for asset in (HEAD, toy_head(16)):
+        model = HeadModel(asset, dtype=torch.float64)
+        neutral = model.canonical(torch.ones(model.shape_size, dtype=torch.float64))
+        joints = model.rest_joints(neutral, torch.zeros(1, model.expression_size, dtype=torch.float64))
+        expected = model(canonical=neutral, **model.pose_arguments([driving]))[0]
+        found = model.driven(neutral[0], joints[0].numpy(), driving)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
 def test_motions_take_rigid_vertices_to_world_space(head):
     """By the whole model, for more poses than one batch holds; the neck's correctives are left out of it."""
     rng = np.random.default_rng(1)

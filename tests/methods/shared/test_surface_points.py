@@ -64,6 +64,8 @@ def test_posed_vertices_are_the_head_models(clip, head):
         **model.pose_arguments([clip.poses[1]]),
     )[0]
     np.testing.assert_allclose(mesh.posed(mesh.arguments([clip.poses[1]])), expected, atol=1e-6)
+    driven = mesh.drive(clip.poses[1]).center
+    np.testing.assert_allclose(driven, expected[mesh.faces].mean(1), atol=1e-6)
 
 
 def test_unposed_drops_rotation_neck_and_translation_only(clip, head):
