@@ -13,7 +13,6 @@ from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.progress import counted
 from ..ga import layout
-from ..inspect.statistics import displacement_metric, novelty
 from .checks_cameras import faulty_cameras, misplaced
 from .evidence import Evidence
 from .rules import Hit, rule, some, spans
@@ -197,6 +196,8 @@ def _untrained_expressions(evidence: Evidence) -> Iterator[Hit]:
     Record or train on more expressions, or regard the results as extrapolation: no training frame has such
     expressions.
     """
+    from ..inspect.statistics import displacement_metric, novelty  # of no use before a run
+
     if evidence.subject is None:
         return
     test: dict[str, set[int]] = defaultdict(set)
