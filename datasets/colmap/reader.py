@@ -278,8 +278,6 @@ def export_model(
     `image_name`. "flat" is for readers that expect all images in one folder (3D Gaussian splatting and its derivatives);
     masks are then also written under the image's own name.
     """
-    if not keys:
-        raise InputError("frames to export", "", "at least one", "none")
     ids = sorted({key.camera for key in keys})
     for name in ids:
         if abs(clip.cameras[name].K[0, 1]) > _SKEW_TOLERANCE:

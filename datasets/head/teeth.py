@@ -38,9 +38,6 @@ def with_teeth(arrays: HeadArrays) -> HeadArrays:
     (mean of the matching upper and lower lip vertex), and have no expression, pose correctives, influence on joints or place in the chart.
     Adds the regions ``teeth``, ``teeth_upper`` and ``teeth_lower``.
     """
-    if "teeth" in arrays.regions:
-        found = f"{len(arrays.regions['teeth'])} vertices"
-        raise InputError(f"head model {arrays.version!r}", "regions[teeth]", "a head without teeth", found)
     upper, lower = lip_rings(arrays)
     vertices, columns = arrays.template.shape[0], len(upper)
     positions = _positions(arrays.template[upper], arrays.template[lower])

@@ -52,15 +52,10 @@ def recomposite(image: FloatArray, coverage: FloatArray, old: Ground, new: Groun
 
 
 def set_background(clip: CaptureClip, background: Sequence[float]) -> CaptureClip:
-    """The clip on another background."""
-    colour = check_colour(background)
+    """The clip, whose frames all have masks, on another background."""
+    colour = np.asarray(background, dtype=np.float64)
     if np.array_equal(colour, clip.background):
         return clip
-    bare = [key for key in clip.files if not clip.has_mask(key)]
-    if bare:
-        found = f"{len(bare)} without, such as {bare[0]}"
-        expected = "a mask for every frame"
-        raise InputError("set_background", "masks", expected, found, "The step requires masks.")
     parameters = {"background": colour.tolist(), "was": np.asarray(clip.background).tolist()}
     straight = all(files.image is not None and files.mask == files.image for files in clip.files.values())
     if straight and not clip.pixel_steps:

@@ -210,7 +210,6 @@ def test_what_the_model_cannot_hold_is_refused(clip, tmp_path):
     other = clip.derive("test", {}, cameras={twin.camera: camera}, files={twin: clip.files[key]})
     for chosen, keys, naming, message in (
         (clip.derive("test", {}, cameras=skewed), [key], "nested", "no skew"),
-        (clip, [], "nested", "at least one"),
         (other, [twin], "flat", "--names nested"),
     ):
         with pytest.raises(InputError, match=message):
