@@ -6,16 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
 import numpy as np
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ...bench.errors import InputError
-from ...bench.expressions import Expression
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, check_arrays, read_npz
 from ...bench.io.files import atomic_path, digest
 from .geometry import triangle_areas
+
+if TYPE_CHECKING:
+    from ...bench.expressions import Expression
 
 JOINT_NAMES = ("root", "neck", "jaw", "left_eye", "right_eye")
 """Joint order of the layout; every pose argument of the model refers to it."""
