@@ -13,7 +13,8 @@ from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.progress import counted
 from ..ga import layout
-from .checks_cameras import faulty_cameras, misplaced
+from .checks_cameras import misplaced
+from .checks_rig import faulty_cameras
 from .evidence import Evidence
 from .rules import Hit, rule, some, spans
 from .views import MeshFacts, ViewFacts
