@@ -64,7 +64,7 @@ def clip_of(read):
 
 
 def colmap(path):
-    return model_cameras(read_model(path), distortion="left to the images")
+    return model_cameras(read_model(path))
 
 
 READERS = {

@@ -58,24 +58,21 @@ class Lens:
 
     model: str
     """COLMAP's name of the model: a pinhole, or a distortion that can be undone."""
-    parameters: tuple[float, ...]
+    params: tuple[float, ...]
     """In COLMAP's order; lengths in pixels."""
     width: int
     height: int
     """Image size, pixels."""
 
-    def __post_init__(self) -> None:
-        """Raise `InputError` for an invalid lens."""
+    def check(self, file: Path, key: str) -> None:
+        """Raise `InputError` for a model that is not known, or a size or parameter that no camera has."""
         if self.model not in _PARAMETERS:
-            raise InputError("lens", "model", f"one of {', '.join(_PARAMETERS)}", repr(self.model))
+            raise InputError(file, key, f"one of {', '.join(_PARAMETERS)}", self.model)
         names = _PARAMETERS[self.model].split()
-        if len(self.parameters) != len(names) or not np.isfinite(self.parameters).all():
-            expected = f"{len(names)} finite numbers: {', '.join(names)}"
-            raise InputError(f"lens {self.model}", "parameters", expected, str(self.parameters))
-        if min(self._by_name.get("f", 1), self._by_name.get("fx", 1), self._by_name.get("fy", 1)) <= 0:
-            raise InputError(
-                f"lens {self.model}", "parameters", "positive focal lengths", str(self.parameters)
-            )
+        lengths = (self.width, self.height, *(self._by_name.get(name, 1) for name in ("f", "fx", "fy")))
+        if len(self.params) != len(names) or not np.isfinite(self.params).all() or min(lengths) <= 0:
+            expected = f"a size in pixels, and {', '.join(names)}: finite numbers, focal lengths above 0"
+            raise InputError(file, key, expected, f"{self.model} {self.width}x{self.height} {self.params}")
 
     @property
     def K(self) -> FloatArray:
@@ -106,7 +103,7 @@ class Lens:
 
     @property
     def _by_name(self) -> dict[str, float]:
-        return dict(zip(_PARAMETERS[self.model].split(), self.parameters))
+        return dict(zip(_PARAMETERS[self.model].split(), self.params))
 
     @property
     def _coefficients(self) -> FloatArray:
@@ -145,19 +142,10 @@ def undistort_clip(clip: CaptureClip, lenses: Mapping[str, Lens]) -> CaptureClip
 
     ``lenses``: Lens by camera id; cameras without one have no distortion.
     """
-    stray = sorted(set(lenses) - set(clip.cameras))
-    if stray:
-        raise InputError("lenses", stray[0], f"one of {', '.join(sorted(clip.cameras))}", "no such camera")
     bent = {name: lens for name, lens in lenses.items() if lens.distorts}
     if not bent:
         return clip
-    cameras = dict(clip.cameras)
-    for name, lens in bent.items():
-        camera = clip.cameras[name]
-        if (camera.width, camera.height) != (lens.width, lens.height):
-            expected, found = f"{camera.width}x{camera.height}", f"{lens.width}x{lens.height}"
-            raise InputError(f"lens of camera {name}", "size", f"{expected}, that of the images", found)
-        cameras[name] = replace(camera, K=lens.K)
+    cameras = {**clip.cameras, **{name: replace(clip.cameras[name], K=lens.K) for name, lens in bent.items()}}
     lens_of = {clip.recorded(key).camera: bent[key.camera] for key in clip.files if key.camera in bent}
     maps = {lens: lens.map_from(lens.K, lens.width, lens.height) for lens in set(lens_of.values())}
     ground = np.asarray(clip.background, dtype=np.float32)
@@ -171,7 +159,7 @@ def undistort_clip(clip: CaptureClip, lenses: Mapping[str, Lens]) -> CaptureClip
             coverage = undistort_image(coverage, places, 0.0)
         return FramePixels(undistort_image(pixels.image, places, ground), coverage)
 
-    parameters = {name: [lens.model, list(lens.parameters)] for name, lens in sorted(bent.items())}
+    parameters = {name: [lens.model, list(lens.params)] for name, lens in sorted(bent.items())}
     return clip.derive_pixels("undistort", {"lenses": parameters}, undistort, cameras=cameras)
 
 
@@ -185,30 +173,9 @@ def pycolmap() -> Any:
     return package
 
 
-T = TypeVar("T", "ColmapCamera", "ColmapImage")
+T = TypeVar("T", "Lens", "ColmapImage")
 _UNIT_TOLERANCE = 1e-3  # of a quaternion's length; COLMAP normalises quaternions when reading
 _POINT = struct.calcsize("<ddQ")  # x, y and the number of a point of the model
-
-
-@dataclass(frozen=True)
-class ColmapCamera:
-    """Intrinsics. ``params`` are in the order of COLMAP's camera model ``model``, pixels."""
-
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-    def check(self, file: Path, key: str) -> None:
-        """Raise `InputError` for a model that pycolmap does not know, or a size or parameter that no camera has."""
-        count = dict(camera_models().values()).get(self.model)
-        if (
-            count != len(self.params)
-            or min(self.width, self.height) < 1
-            or not np.isfinite(self.params).all()
-        ):
-            expected = "a camera model pycolmap knows, a size in pixels and the model's parameters, finite"
-            raise InputError(file, key, expected, f"{self.model} {self.width}x{self.height} {self.params}")
 
 
 @dataclass(frozen=True)
@@ -235,23 +202,13 @@ class ColmapModel:
     """Cameras and images of a model by COLMAP's ids. The unit of length is the model's own."""
 
     files: tuple[Path, Path]  # of the cameras and of the images
-    cameras: Mapping[int, ColmapCamera]
+    cameras: Mapping[int, Lens]
     images: Mapping[int, ColmapImage]
 
     @property
     def folder(self) -> Path:
         """Folder of the files."""
         return self.files[0].parent
-
-
-@cache
-def camera_models() -> dict[int, tuple[str, int]]:
-    """Name and number of parameters of the camera models pycolmap knows, by COLMAP's number."""
-    names = {int(number): name for name, number in pycolmap().CameraModelId.__members__.items()}
-    create = pycolmap().Camera.create_from_model_name
-    return {
-        k: (name, len(create(1, name, 1.0, 1, 1).params)) for k, name in names.items() if name != "INVALID"
-    }
 
 
 class _Bytes:
@@ -287,12 +244,14 @@ class _Bytes:
             )
 
 
-def _cameras_binary(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
+def _cameras_binary(file: Path) -> Iterator[tuple[int, Lens]]:
     stream = _Bytes(file)
+    models = {int(number): name for name, number in pycolmap().CameraModelId.__members__.items()}
     for _ in stream.entries("cameras"):
         number, model, width, height = stream.numbers("IiQQ", "camera")
-        name, count = camera_models().get(model, (f"number {model}", 0))
-        yield number, ColmapCamera(name, width, height, stream.numbers(f"{count}d", f"camera {number}"))
+        name = models.get(model, f"number {model}")
+        count = len(_PARAMETERS.get(name, "").split())
+        yield number, Lens(name, stream.numbers(f"{count}d", f"camera {number}"), width, height)
 
 
 def _images_binary(file: Path) -> Iterator[tuple[int, ColmapImage]]:
@@ -304,13 +263,12 @@ def _images_binary(file: Path) -> Iterator[tuple[int, ColmapImage]]:
         yield number, ColmapImage(with_slashes(name), camera, tuple(pose[:4]), tuple(pose[4:]))
 
 
-def _cameras_text(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
+def _cameras_text(file: Path) -> Iterator[tuple[int, Lens]]:
     for line, text in _lines(file):
         if words := text.split():
             with reading(file, "a number, a camera model, a size and parameters", f"line {line}"):
                 number, model, width, height, *params = words
-                camera = ColmapCamera(model, int(width), int(height), tuple(map(float, params)))
-                yield int(number), camera
+                yield int(number), Lens(model, tuple(map(float, params)), int(width), int(height))
 
 
 def _images_text(file: Path) -> Iterator[tuple[int, ColmapImage]]:

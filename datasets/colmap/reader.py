@@ -67,26 +67,11 @@ _FLAT_NAME = re.compile(r"(?P<sequence>.+)_(?P<timestep>\d{5,})_(?P<camera>.+)")
 _VHAP_NAME = re.compile(r"(?P<timestep>\d+)_(?P<camera>.+)")
 
 
-def model_cameras(
-    model: ColmapModel, *, distortion: Literal["refuse", "left to the images"] = "refuse"
-) -> dict[str, Camera]:
-    """Camera of each image by the image's name, which is also its id.
-
-    ``distortion``: How to treat distortion, which `Camera` lacks. "refuse" raises if a camera of the model is distorted;
-    "left to the images" gives the cameras of the undistorted images, which `undistort_clip` makes with `model_lenses`.
-    """
-    lenses = {number: _lens(model, number) for number in model.cameras}
+def model_cameras(model: ColmapModel) -> dict[str, Camera]:
+    """Camera of each image by the image's name, which is also its id; of its undistorted image where the lens distorts."""
     cameras: dict[str, Camera] = {}
     for number, image in sorted(model.images.items()):
-        lens = lenses[image.camera]
-        if lens.distorts and distortion == "refuse":
-            raise InputError(
-                model.folder,
-                f"camera {image.camera}",
-                "a camera without lens distortion (PINHOLE or SIMPLE_PINHOLE)",
-                f"{lens.model} with parameters {', '.join(f'{value:g}' for value in lens.parameters)}",
-                "Undistort images and model together (`colmap image_undistorter`), or the clip by undistort_clip.",
-            )
+        lens = model.cameras[image.camera]
         if image.name in cameras:
             expected = "image names that differ"
             raise InputError(model.folder, f"image {number}", expected, f"{image.name!r} again")
@@ -96,20 +81,6 @@ def model_cameras(
         world_to_camera[:3, 3] = image.translation
         cameras[image.name] = Camera(image.name, lens.width, lens.height, lens.K, world_to_camera)
     return cameras
-
-
-def model_lenses(model: ColmapModel) -> dict[str, Lens]:
-    """Lens of each image by the image's name; raises `InputError` for a camera model that is not known."""
-    return {image.name: _lens(model, image.camera) for image in model.images.values()}
-
-
-def _lens(model: ColmapModel, number: int) -> Lens:
-    camera = model.cameras[number]
-    try:
-        return Lens(camera.model, camera.params, camera.width, camera.height)
-    except InputError as error:
-        key = f"camera {number}"
-        raise InputError(model.folder, key, error.expected, error.found, error.remedy) from error
 
 
 def find_datasets(root: Path) -> list[Path]:
@@ -243,8 +214,8 @@ def _frame_files(root: Path, name: str) -> FrameFiles:
 
 def _rig(model: ColmapModel, keys: Mapping[str, FrameKey]) -> tuple[dict[str, Camera], dict[str, Lens]]:
     """Camera and lens by camera id; a camera must be the same in all its images."""
-    found = model_cameras(model, distortion="left to the images")
-    lens_of = model_lenses(model)
+    found = model_cameras(model)
+    lens_of = {image.name: model.cameras[image.camera] for image in model.images.values()}
     cameras: dict[str, Camera] = {}
     lenses: dict[str, Lens] = {}
     for name, key in keys.items():
@@ -307,8 +278,6 @@ def export_model(
     `image_name`. "flat" is for readers that expect all images in one folder (3D Gaussian splatting and its derivatives);
     masks are then also written under the image's own name.
     """
-    if not keys:
-        raise InputError("frames to export", "", "at least one", "none")
     ids = sorted({key.camera for key in keys})
     for name in ids:
         if abs(clip.cameras[name].K[0, 1]) > _SKEW_TOLERANCE:

@@ -6,16 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
 import numpy as np
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ...bench.errors import InputError
-from ...bench.expressions import Expression
-from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, check_arrays, read_arrays
+from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, check_arrays, read_npz
 from ...bench.io.files import atomic_path, digest
 from .geometry import triangle_areas
+
+if TYPE_CHECKING:
+    from ...bench.expressions import Expression
 
 JOINT_NAMES = ("root", "neck", "jaw", "left_eye", "right_eye")
 """Joint order of the layout; every pose argument of the model refers to it."""
@@ -202,7 +205,12 @@ def save_head(path: Path, arrays: HeadArrays) -> None:
 
 def read_head(path: Path) -> HeadArrays:
     """Read what `save_head` wrote, validated."""
-    content = read_arrays(path, {"format": TEXT})
+    return head_of(path, read_npz(path))
+
+
+def head_of(path: Path, content: Mapping[str, np.ndarray]) -> HeadArrays:
+    """The head of the members of a file that `save_head` wrote, validated."""
+    check_arrays(path, content, {"format": TEXT})
     if str(content["format"]) != FORMAT:
         raise InputError(path, "format", repr(FORMAT), repr(str(content["format"]))[:80])
     check_arrays(path, content, _FILE)

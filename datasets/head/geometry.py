@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from ...bench.contracts import Camera, FloatArray, IntArray
 
@@ -63,6 +65,16 @@ def border_edges(faces: IntArray) -> IntArray:
     edges = mesh_edges(faces)
     _, inverse, count = unique_pairs(np.sort(edges, axis=1))
     return edges[count[inverse] == 1]
+
+
+def connected_pieces(vertices: IntArray, edges: IntArray) -> list[IntArray]:
+    """Connected pieces of the mesh restricted to some of its vertices, sorted; ``edges``: (n, 2) of the whole mesh."""
+    count = 1 + max(int(edges.max()), int(vertices.max(initial=0)))
+    inside = np.isin(np.arange(count), vertices)
+    inner = edges[inside[edges].all(axis=1)]
+    graph = coo_matrix((np.ones(len(inner)), inner.T), shape=(count, count))
+    labels = connected_components(graph, directed=False)[1][vertices]
+    return [vertices[labels == label] for label in np.unique(labels)]
 
 
 def triangle_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:

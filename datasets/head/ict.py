@@ -24,8 +24,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from skimage.measure import points_in_poly
 
 from ...bench.contracts import FloatArray, IntArray
@@ -39,6 +37,7 @@ from .geometry import (
     REGRESSOR_BITS,
     SHARE_BITS,
     border_edges,
+    connected_pieces,
     even_weights,
     fit_sphere,
     mesh_edges,
@@ -56,6 +55,7 @@ DROPPED_SHAPES = (JAW_SHAPE, "mouthClose")
 
 _METRES = 0.01
 _SOFTNESS = 0.004  # metres; see hinge_weights
+_EACH_SIDE = 60  # vertices around the axis of the jaw
 _LARGEST = MAX_MAGNITUDE / _METRES  # centimetres
 _KEYS = {
     "v_neutral": Member("f", ("V", 3), _LARGEST),
@@ -259,12 +259,12 @@ def _regressor(template: FloatArray, hinge: Hinge, parts: Parts, profile: Profil
     return regressor
 
 
-def _around_axis(template: FloatArray, skin: IntArray, hinge: Hinge, each_side: int = 60) -> IntArray:
+def _around_axis(template: FloatArray, skin: IntArray, hinge: Hinge) -> IntArray:
     """The skin vertices nearest to the hinge's axis, equally many on either side."""
     distance = np.linalg.norm(template[skin, 1:] - hinge.center[1:], axis=1)
     sides = [skin[template[skin, 0] > 0], skin[template[skin, 0] < 0]]
     distances = [distance[template[skin, 0] > 0], distance[template[skin, 0] < 0]]
-    nearest = [side[np.argsort(away)[:each_side]] for side, away in zip(sides, distances)]
+    nearest = [side[np.argsort(away)[:_EACH_SIDE]] for side, away in zip(sides, distances)]
     return np.unique(np.concatenate(nearest))
 
 
@@ -317,7 +317,9 @@ def mesh_parts(
             raise InputError(file, "material_names", f"triangles of {name}", ", ".join(sorted(materials)))
     # Behind the face material are the outer head and, as separate pieces, the mouth and eye sockets.
     back = np.setdiff1d(materials["M_BackHead"], materials["M_Face"])
-    outer, *inner = sorted(_pieces(back, faces), key=lambda piece: -template[piece, 1].max())
+    outer, *inner = sorted(
+        connected_pieces(back, mesh_edges(faces)), key=lambda piece: -template[piece, 1].max()
+    )
     sides = [len(np.unique(template[piece, 0] > 0)) for piece in inner]
     teeth = materials["M_Teeth"]
     motion = np.linalg.norm(jaw_open[teeth], axis=1)
@@ -393,17 +395,6 @@ def regions_of(
     regions = {name: everything[mask] for name, mask in masks.items()}
     pieces = {name: piece for name, piece in parts.items() if name not in ("face_material", "outer_back")}
     return regions | pieces | {"boundary": np.intersect1d(border_edges(faces), everything[skin | outer])}
-
-
-def _pieces(vertices: IntArray, faces: IntArray) -> list[IntArray]:
-    """Connected pieces of the mesh restricted to the vertices."""
-    renumbered = np.full(int(faces.max()) + 1, -1)
-    renumbered[vertices] = np.arange(len(vertices))
-    edges = renumbered[mesh_edges(faces)]
-    edges = edges[(edges >= 0).all(1)]
-    graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(vertices),) * 2)
-    count, labels = connected_components(graph, directed=False)
-    return [vertices[labels == label] for label in range(count)]
 
 
 def _together(pieces: list[IntArray]) -> IntArray:

@@ -28,11 +28,10 @@ import numpy as np
 
 from ...bench.contracts import FloatArray, IntArray
 from ...bench.errors import InputError
-from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy, read_pickle
+from ...bench.io.arrays import MAX_MAGNITUDE, check_numbers, read_npy, read_npz, read_pickle
 from ...bench.io.documents import read_json, read_text
 from ...bench.io.files import open_regular, reading
-from .arrays import RING_REGIONS, HeadArrays, read_head, with_derived_regions
-from .ict import ict_head, is_ict, read_ict
+from .arrays import RING_REGIONS, HeadArrays, head_of, with_derived_regions
 
 CHART_FILES = ("head_template_mesh.obj", "head_template.obj")
 """FLAME's mesh with texture coordinates, as VHAP and GaussianAvatars, and DECA, name it."""
@@ -122,8 +121,13 @@ def load_head(
         with open_regular(path, "a head model file") as stream:
             start = stream.read(len(_ZIP))
     if start == _ZIP:
-        content = read_ict(path)
-        head = ict_head(path, content) if is_ict(content) else read_head(path)
+        content = None if path.is_dir() else read_npz(path)
+        if content is None or "v_neutral" in content:
+            from .ict import ict_head, read_ict  # slow to import
+
+            head = ict_head(path, read_ict(path) if content is None else content)
+        else:
+            head = head_of(path, content)
         if version is not None and version != head.version:
             raise InputError(path, "version", repr(version), repr(head.version))
     elif start[:1] not in _PICKLES or path.suffix.lower() in MESHES:

@@ -138,7 +138,7 @@ class HeadModel(torch.nn.Module):
             the largest array.
         """
         neutral = self._neutral(shape, static_offset, canonical)
-        expression = _rows(expression, self.expression_size, "expression")
+        expression = _rows(expression)
         angles = self.angles(rotation, neck, jaw, eyes)
         rotations = axis_angle_to_matrix(angles)
         shaped = neutral + (expression @ self.expression_matrix).unflatten(1, (-1, 3))
@@ -146,11 +146,10 @@ class HeadModel(torch.nn.Module):
         motions = joint_motions(rotations, self.rest_joints(neutral, expression), self.parents)
         blended = (self.skinning_weights @ motions.flatten(2)).unflatten(2, (3, 4))
         moved = (blended[..., :3] @ posed[..., None])[..., 0] + blended[..., 3]
-        vertices = moved + _rows(translation, 3, "translation")[:, None]
+        vertices = moved + _rows(translation)[:, None]
         if eyelids is not None:
-            if self.eyelid_matrix is None:
-                raise ValueError(f"head model {self.version!r} has no eyelid basis, but eyelids were given")
-            lids = (_rows(eyelids, 2, "eyelids") @ self.eyelid_matrix).unflatten(1, (-1, 3))
+            assert self.eyelid_matrix is not None
+            lids = (_rows(eyelids) @ self.eyelid_matrix).unflatten(1, (-1, 3))
             vertices = vertices + lids @ (rotations[:, 0] @ rotations[:, 1]).mT
         return vertices
 
@@ -185,18 +184,13 @@ class HeadModel(torch.nn.Module):
 
     def canonical(self, shape: Tensor, static_offset: Tensor | None = None) -> Tensor:
         """Neutral, unposed head of an identity: (B, V, 3), metres."""
-        blend = _rows(shape, self.shape_size, "shape") @ self.shape_matrix
+        blend = _rows(shape) @ self.shape_matrix
         vertices = self.template + blend.unflatten(1, (-1, 3))
-        if static_offset is None:
-            return vertices
-        if static_offset.shape[-2:] != self.template.shape:
-            found = tuple(static_offset.shape)
-            raise ValueError(f"static_offset: expected (..., {len(self.template)}, 3), found {found}")
-        return vertices + static_offset
+        return vertices if static_offset is None else vertices + static_offset
 
     def joints(self, shape: Tensor, expression: Tensor, static_offset: Tensor | None = None) -> Tensor:
         """Joint positions of the shaped, unposed head: (B, J, 3), metres."""
-        expression = _rows(expression, self.expression_size, "expression")
+        expression = _rows(expression)
         return self.rest_joints(self.canonical(shape, static_offset), expression)
 
     def rest_joints(self, neutral: Tensor, expression: Tensor) -> Tensor:
@@ -216,11 +210,11 @@ class HeadModel(torch.nn.Module):
         """Rigid motion of the head, (B, 4, 4): translation after the root's and the neck's rotation. This is the head
         pose of trackers: it moves vertices that follow only the neck joint, apart from the neck's pose correctives."""
         joints = self.joints(shape, expression, static_offset)
-        still = torch.zeros_like(_rows(rotation, 3, "rotation"))
+        still = torch.zeros_like(_rows(rotation))
         angles = self.angles(rotation, neck, still, torch.cat([still, still], dim=-1))
         rotations = axis_angle_to_matrix(angles)
         motion = joint_motions(rotations, joints, self.parents)[:, 1]
-        turn, shift = motion[..., :3], motion[..., 3] + _rows(translation, 3, "translation")
+        turn, shift = motion[..., :3], motion[..., 3] + _rows(translation)
         batch = shift.shape[0]
         last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=turn.dtype, device=turn.device).expand(batch, 1, 4)
         return torch.cat([torch.cat([turn.expand(batch, 3, 3), shift[..., None]], dim=-1), last], dim=-2)
@@ -236,8 +230,6 @@ class HeadModel(torch.nn.Module):
 
     def pose_columns(self, poses: Sequence[HeadPose]) -> dict[str, FloatArray]:
         """Result of `pose_arguments` as float64 arrays on the host: (T, n) each."""
-        if not poses:
-            raise InputError("poses", "", "at least one pose", "none")
         sizes = {"expression": self.expression_size, "rotation": 3, "neck": 3, "jaw": 3, "eyes": 6}
         sizes["translation"] = 3
         for pose in poses:
@@ -266,19 +258,14 @@ class HeadModel(torch.nn.Module):
         self, shape: Tensor | None, static_offset: Tensor | None, canonical: Tensor | None
     ) -> Tensor:
         """(B, V, 3) neutral head, given directly or by identity."""
-        if (shape is None) == (canonical is None):
-            raise ValueError("give the identity once: either shape or canonical")
-        if canonical is None:
-            assert shape is not None
-            return self.canonical(shape, static_offset)
-        if static_offset is not None:
-            raise ValueError("canonical already includes the static offset")
-        return canonical
+        if canonical is not None:
+            return canonical
+        assert shape is not None
+        return self.canonical(shape, static_offset)
 
     def angles(self, rotation: Tensor, neck: Tensor, jaw: Tensor, eyes: Tensor) -> Tensor:
         """Axis-angle vectors in joint order, (B, J, 3)."""
-        given = (rotation, 3, "rotation"), (neck, 3, "neck"), (jaw, 3, "jaw"), (eyes, 6, "eyes")
-        parts = [_rows(*part) for part in given]
+        parts = [_rows(part) for part in (rotation, neck, jaw, eyes)]
         batch = max(part.shape[0] for part in parts)
         return torch.cat([part.expand(batch, -1) for part in parts], dim=1).unflatten(1, (-1, 3))
 
@@ -317,12 +304,9 @@ def joint_motions(rotations: Tensor, joints: Tensor, parents: Sequence[int]) -> 
     return torch.stack(columns, dim=1)
 
 
-def _rows(values: Tensor, size: int, name: str) -> Tensor:
-    """(B, size), with a batch axis added to a vector."""
-    rows = values if values.ndim > 1 else values[None]
-    if rows.ndim != 2 or rows.shape[1] != size:
-        raise ValueError(f"{name}: expected (B, {size}) or ({size},), found {tuple(values.shape)}")
-    return rows
+def _rows(values: Tensor) -> Tensor:
+    """(B, n), with a batch axis added to a vector."""
+    return values if values.ndim > 1 else values[None]
 
 
 BATCH = 64

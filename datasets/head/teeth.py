@@ -9,13 +9,11 @@ import logging
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
 from ...bench.errors import InputError
 from .arrays import JOINT_NAMES, RING_REGIONS, HeadArrays
-from .geometry import mesh_edges
+from .geometry import connected_pieces, mesh_edges
 
 _log = logging.getLogger(__name__)
 
@@ -40,9 +38,6 @@ def with_teeth(arrays: HeadArrays) -> HeadArrays:
     (mean of the matching upper and lower lip vertex), and have no expression, pose correctives, influence on joints or place in the chart.
     Adds the regions ``teeth``, ``teeth_upper`` and ``teeth_lower``.
     """
-    if "teeth" in arrays.regions:
-        found = f"{len(arrays.regions['teeth'])} vertices"
-        raise InputError(f"head model {arrays.version!r}", "regions[teeth]", "a head without teeth", found)
     upper, lower = lip_rings(arrays)
     vertices, columns = arrays.template.shape[0], len(upper)
     positions = _positions(arrays.template[upper], arrays.template[lower])
@@ -195,7 +190,7 @@ def _depth_of_lips(asset: HeadAsset, edges: IntArray) -> IntArray:
     if not len(border):  # a mesh of only lips
         border = np.flatnonzero(lips)
     # The inner border, towards the mouth, is the narrower one.
-    outer = max(_pieces(edges, border, len(lips)), key=lambda piece: np.ptp(asset.template[piece, 0]))
+    outer = max(connected_pieces(border, edges), key=lambda piece: np.ptp(asset.template[piece, 0]))
     depth = np.full(len(lips), -1)
     depth[outer] = 0
     reached, steps = outer, 0
@@ -212,20 +207,11 @@ def _arc(asset: HeadAsset, edges: IntArray, ring: np.ndarray, place: int) -> Int
     members = np.flatnonzero(ring)
     x = asset.template[members, 0]
     rest = np.setdiff1d(members, members[[x.argmin(), x.argmax()]])
-    halves = sorted(_pieces(edges, rest, len(ring)), key=len)[-2:]
+    halves = sorted(connected_pieces(rest, edges), key=len)[-2:]
     if len(halves) < 2:
         return np.empty(0, np.int64)
     weights = asset.skinning_weights[:, JOINT_NAMES.index("jaw")]
     return sorted(halves, key=lambda half: float(weights[half].mean()))[place]
-
-
-def _pieces(edges: IntArray, members: IntArray, vertices: int) -> list[IntArray]:
-    """Connected pieces of a part of the mesh, as vertices."""
-    inside = np.isin(np.arange(vertices), members)
-    inner = edges[inside[edges].all(axis=1)]
-    graph = coo_matrix((np.ones(len(inner)), inner.T), shape=(vertices, vertices))
-    labels = connected_components(graph, directed=False)[1][members]
-    return [members[labels == label] for label in np.unique(labels)]
 
 
 def _pick(asset: HeadAsset, rim: IntArray, across: np.ndarray) -> IntArray:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ...bench.contracts import Clip, HeadAsset, no_progress
 from ..clip import as_capture
-from . import checks_cameras, checks_files, checks_images, checks_tracking
+from . import checks_cameras, checks_files, checks_images, checks_rig, checks_tracking
 from .evidence import Evidence
 from .rules import Finding, Rule, apply
 from .settings import LintSettings
@@ -30,7 +30,7 @@ GROUPS = {
 RULES = sorted(
     (
         rule
-        for checks in (checks_cameras, checks_files, checks_images, checks_tracking)
+        for checks in (checks_cameras, checks_files, checks_images, checks_rig, checks_tracking)
         for rule in vars(checks).values()
         if isinstance(rule, Rule)
     ),

@@ -13,8 +13,8 @@ from ...bench.progress import counted
 from ..ga import layout
 from ..ga.transforms import FrameEntry
 from .capture import Slot
-from .checks_cameras import dead_cameras
 from .checks_images import unit_range
+from .checks_rig import dead_cameras
 from .evidence import Evidence
 from .rules import Hit, at, rule, some, spans
 from .views import Thumbnail, near_duplicates

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ...bench.progress import counted
-from .checks_cameras import blank_cameras, faulty_cameras
+from .checks_rig import blank_cameras, faulty_cameras
 from .evidence import Evidence, first_entries
 from .rules import Hit, rule, some
 from .views import BACKGROUND_LEVELS, MaskFacts, ViewFacts

@@ -13,8 +13,8 @@ from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.progress import counted
 from ..ga import layout
-from ..inspect.statistics import displacement_metric, novelty
-from .checks_cameras import faulty_cameras, misplaced
+from .checks_cameras import misplaced
+from .checks_rig import faulty_cameras
 from .evidence import Evidence
 from .rules import Hit, rule, some, spans
 from .views import MeshFacts, ViewFacts
@@ -197,6 +197,8 @@ def _untrained_expressions(evidence: Evidence) -> Iterator[Hit]:
     Record or train on more expressions, or regard the results as extrapolation: no training frame has such
     expressions.
     """
+    from ..inspect.statistics import displacement_metric, novelty  # of no use before a run
+
     if evidence.subject is None:
         return
     test: dict[str, set[int]] = defaultdict(set)

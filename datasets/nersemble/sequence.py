@@ -20,6 +20,7 @@ import cv2
 from ...bench.errors import InputError
 from ...bench.io.files import entries
 from ...bench.io.images import probe_image
+from ..lint.rules import spans
 from .names import numbered, serial_of
 from .recording import Calibration, Participant
 
@@ -298,24 +299,11 @@ def _lacking(missing: Mapping[str, set[int]]) -> str:
     groups: dict[str, list[str]] = {}
     for serial, numbers in missing.items():
         if numbers:
-            groups.setdefault(_ranges(sorted(numbers)), []).append(serial)
+            groups.setdefault(spans(numbers, limit=8), []).append(serial)
     return "; ".join(
         f"camera{'s' if len(serials) > 1 else ''} {', '.join(serials)} without {listed}"
         for listed, serials in groups.items()
     )
-
-
-def _ranges(numbers: Sequence[int], most: int = 8) -> str:
-    """Ascending numbers as "2, 4-7"; those after ``most`` ranges are only counted."""
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1].append(number)
-        else:
-            runs.append([number])
-    listed = ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs[:most])
-    rest = sum(len(run) for run in runs[most:])
-    return f"{listed} and {rest} more" if rest else listed
 
 
 def check_boxes(path: Path) -> None:

@@ -89,7 +89,6 @@ class Alignment:
 
     def camera(self, camera: Camera) -> Camera:
         """The camera of the aligned images."""
-        _check_size(f"camera {camera.id}", self.source, (camera.width, camera.height))
         for move in self.moves:
             if isinstance(move, Resize):
                 camera = camera.resized(move.width, move.height)
@@ -100,7 +99,6 @@ class Alignment:
     def image(self, image: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
         """Align a composited float32 image (H, W, 3) in [0, 1]; boxes are padded with ``background``. Coverage is
         aligned the same way as (H, W, 1) on background 0."""
-        _check_size("image", self.source, (image.shape[1], image.shape[0]))
         for move in self.moves:
             if isinstance(move, Resize):
                 image = _resized(image, move.width, move.height)
@@ -111,7 +109,9 @@ class Alignment:
     def restore(self, render: FloatArray, background: Sequence[float] | FloatArray) -> FloatArray:
         """Convert an (H, W, 3) render of the aligned view to the source's size, in one antialiased resizing. Cropped
         parts become ``background``."""
-        _check_size("render", self.aligned_size, (render.shape[1], render.shape[0]))
+        (width, height), found = self.aligned_size, (render.shape[1], render.shape[0])
+        if found != (width, height):
+            raise InputError("render", "size", f"{width}x{height}", f"{found[0]}x{found[1]}")
         boxes = [move for move in self.moves if isinstance(move, PixelBox)]
         box = boxes[0] if boxes else PixelBox(0, 0, *self.source)
         whole = _resized(np.asarray(render, np.float32), box.width, box.height)
@@ -171,15 +171,6 @@ def _resized(image: FloatArray, width: int, height: int) -> FloatArray:
     return np.clip(resize_image(image, width, height), 0, 1)
 
 
-def _check_size(what: str, expected: Size, found: Size) -> None:
-    if expected != found:
-        raise InputError(what, "size", f"{expected[0]}x{expected[1]}", f"{found[0]}x{found[1]}")
-
-
-MAX_SIDE = 32767
-"""Maximum side of an image, the limit of OpenCV's resizing."""
-
-
 def resize_image(image: FloatArray, width: int, height: int) -> FloatArray:
     """Resize a float32 image (H, W) or (H, W, C).
 
@@ -188,11 +179,6 @@ def resize_image(image: FloatArray, width: int, height: int) -> FloatArray:
     when a side shrinks, to avoid aliasing; it reproduces linear ramps and overshoots at edges by up to some per cent,
     so clamp if necessary. Weights outside the image are dropped and the rest renormalised.
     """
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise InputError("resize", "size", f"sides of 1 to {MAX_SIDE} pixels", f"{width}x{height}")
-    if image.dtype != np.float32 or image.ndim not in (2, 3) or 0 in image.shape:
-        found = f"{image.dtype} of shape {image.shape}"
-        raise InputError("resize", "image", "float32 of shape (H, W) or (H, W, C)", found)
     rows, columns = image.shape[:2]
     if (rows, columns) == (height, width):
         return image

@@ -52,11 +52,10 @@ def recomposite(image: FloatArray, coverage: FloatArray, old: Ground, new: Groun
 
 
 def set_background(clip: CaptureClip, background: Sequence[float]) -> CaptureClip:
-    """The clip on another background."""
-    colour = check_colour(background)
+    """The clip, whose frames all have masks, on another background."""
+    colour = np.asarray(background, dtype=np.float64)
     if np.array_equal(colour, clip.background):
         return clip
-    _check_masks(clip, "set_background")
     parameters = {"background": colour.tolist(), "was": np.asarray(clip.background).tolist()}
     straight = all(files.image is not None and files.mask == files.image for files in clip.files.values())
     if straight and not clip.pixel_steps:
@@ -144,9 +143,9 @@ NO_PERSON, CLOTH, CLASSES = 0, 16, 19
 """Labels of CelebAMask-HQ in the order of face-parsing.PyTorch, and their number."""
 
 
-def read_labels(path: Path, size: tuple[int, int] | None = None) -> ByteArray:
+def read_labels(path: Path) -> ByteArray:
     """(H, W) labels of an image of `CLASSES` labels."""
-    pixels = read_pixels(path, size)
+    pixels = read_pixels(path)
     if pixels.ndim != 2 or pixels.max() >= CLASSES:
         expected = f"a grey 8-bit image of labels from 0 to {CLASSES - 1}, as face-parsing.PyTorch gives them"
         found = f"levels up to {pixels.max()}" if pixels.ndim == 2 else "colours"
@@ -217,10 +216,3 @@ def check_colour(values: Sequence[float] | FloatArray) -> FloatArray:
     if colour.shape != (3,) or not ((colour >= 0) & (colour <= 1)).all():
         raise InputError("colour", "background", "three numbers in [0, 1]", str(values))
     return colour
-
-
-def _check_masks(clip: CaptureClip, step: str) -> None:
-    bare = [key for key in clip.files if not clip.has_mask(key)]
-    if bare:
-        found = f"{len(bare)} without, such as {bare[0]}"
-        raise InputError(step, "masks", "a mask for every frame", found, "The step requires masks.")

@@ -27,10 +27,11 @@ from ...bench.errors import HeadbenchError, InputError
 from ...bench.executors.settings import Execution
 from ...bench.executors.task import TASK_LOG, Task
 from ...bench.io.documents import read_json
-from ...bench.io.files import user_files, write_bytes, write_json, write_text
+from ...bench.io.files import user_files, write_json, write_text
 from ...bench.io.provenance import SYNTHETIC, xmp
 from ...bench.machine import processor_count
 from ...bench.start import end_with_parent, starting_workers
+from ..ga.writer import link_or_copy
 from ..images import is_whole
 from .panels import KERNEL, default_samples, sample_count
 from .performance import KINDS, Kind, share_out
@@ -90,36 +91,12 @@ def synthesize(
 ) -> list[Path]:
     """Render ``subjects`` heads with a performance and write them as captures; return their union folders.
 
+    Settings are those of `headbench synth`, documented at `command.SynthSettings`.
+
     Parameters
     ----------
-    subjects : int
-        Number of heads, each with its own capture.
-    cameras : int
-        2 to 16; the frontal one is always included and held out as the novel view.
-    timesteps : int
-        Number per subject, distributed over the sequences; FREE is held out for self-reenactment, and
-        its frames with the tongue out are labelled as excluded.
-    size : tuple[int, int]
-        (width, height) of the images, pixels.
-    head : str
-        "procedural", or the path of a head model (ICT-FaceKit).
-    seed : int
-        Seed of the heads and their performances.
-    tracking_noise : float
-        Standard deviation of the error of each stored parameter, as a fraction of that parameter's
-        own standard deviation over the subject's timesteps. Images show the exact poses.
     samples_per_pixel : int | None
         Rounded up to a count that the sampler supports; the default gives at least 43 dB between two renders of a frame.
-    tracking_error : float
-        Level of simulated tracking errors, 0 to 4; 1 is 0.5 to 1 mm on the face.
-    tracker : Tracker
-        Whether these errors are those of a tracker of single frames or of videos.
-    hair_lag, camera_colour, motion_blur, mask_error, correctives : float
-        Levels, 0 to 4, of further imperfections of recordings.
-    performance : Kind
-        What the subject does: "natural", "full", "parts", "expressions" or "still". `headbench synth --help` describes them.
-    dynamics : float
-        Scale of wrinkles and blush, 0 to 3: with 0 the skin keeps its colour at rest.
     edition : int
         Edition of a capture to reproduce; only the current one is accepted.
     pictures : str | Path | None
@@ -356,11 +333,7 @@ def _take_over(pictures: Path, out: Path, plans: Sequence[SubjectPlan]) -> None:
                     raise InputError(source, "", "a picture of the capture", "none that is whole", remedy)
                 if path.exists():
                     continue
-                path.parent.mkdir(parents=True, exist_ok=True)
-                try:
-                    os.link(source, path)
-                except OSError:  # another file system, or one without links
-                    write_bytes(path, source.read_bytes())
+                link_or_copy(source, path)
 
 
 def _claim(out: Path, wanted: Mapping[str, Any]) -> None:
@@ -376,18 +349,10 @@ def _claim(out: Path, wanted: Mapping[str, Any]) -> None:
                 )
                 raise InputError(manifest, key, expected, f"{manifest_data.get(key)!r}", remedy)
     else:
-        if any(_is_foreign(path) for path in user_files(out)):
+        if user_files(out):
             raise InputError(out, "", "an empty folder or an earlier synthetic capture", "other files")
         write_json(manifest, wanted)
     if not readme.exists():
         write_text(readme, _README)
     if not (out / MARK).exists():
         write_text(out / MARK, xmp(SYNTHETIC))
-
-
-def _is_foreign(path: Path) -> bool:
-    """Whether a file cannot come from a killed start of this command before the manifest."""
-    if path.name == "README.txt" and path.is_file():
-        ours = _README.encode()
-        return path.stat().st_size != len(ours) or path.read_bytes() != ours
-    return True

@@ -167,8 +167,6 @@ class PanelTracer:
         surroundings: Sequence[float] = SURROUNDINGS,
         instruction_set: str | None = None,
     ) -> None:
-        if len(lights) > MOST_PANELS:
-            raise InputError("panels", "", f"at most {MOST_PANELS}", str(len(lights)))
         self._grid = math.isqrt(sample_count(samples))
         self._module: Any = KERNEL.load()
         self._instruction_set = instruction_set or KERNEL.instruction_sets[0]

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...bench.contracts import FloatArray, HeadAsset, IntArray
-from ...bench.errors import InputError
 from ..head.geometry import smoothstep
 from ..head.procedural.sculpture import resample
 from ..head.procedural.surface import JAW, NECK, PARENTS
@@ -45,15 +44,11 @@ class MouthMesh:
 def render_parts(
     head: HeadAsset, shape: FloatArray | None = None, tongue_out: float = 0.0
 ) -> list[MouthMesh]:
-    """Teeth, gums and tongue in a subject's neutral shape.
+    """Teeth, gums and tongue of a procedural head in a subject's neutral shape.
 
     ``shape``: (S,) identity coefficients; the mean head if None. Parts follow the surrounding wall of the mouth.
     ``tongue_out``: 0 places the tongue behind the lower teeth, 1 over the lower lip (the jaw should be open).
     """
-    if "mouth_socket" not in head.regions or not head.version.startswith("procedural"):
-        raise InputError(f"head model {head.version!r}", "regions", "a procedural head", "another head")
-    if not 0 <= tongue_out <= 1:
-        raise InputError("render_parts", "tongue_out", "a number in [0, 1]", str(tongue_out))
     meshes = {
         "upper_teeth": (*_teeth(UPPER_WIDTHS, 0.0690, edge=-0.0530, root=-0.0430), NECK, "teeth"),
         "lower_teeth": (*_teeth(LOWER_WIDTHS, 0.0662, edge=-0.0518, root=-0.0600), JAW, "teeth"),

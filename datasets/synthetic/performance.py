@@ -513,13 +513,11 @@ ICT_TARGETS: Mapping[str, tuple[str, ...]] = {
 """ICT-FaceKit shapes that play each expression control."""
 
 
-def named_translation(
-    head: HeadAsset, names: Sequence[str], targets: Mapping[str, Sequence[str]]
-) -> Translation:
-    """Translation for a head whose expression directions have names; ``targets`` are those of each control."""
+def ict_translation(head: HeadAsset, names: Sequence[str]) -> Translation:
+    """Translation for a head whose expression directions have the names of ICT-FaceKit's shapes."""
     matrix = np.zeros((len(EXPRESSION_CONTROLS), head.expression_basis.shape[2]))
     for row, control in enumerate(EXPRESSION_CONTROLS):
-        for name in targets.get(control, ()):
+        for name in ICT_TARGETS.get(control, ()):
             if name not in names:
                 raise InputError(head.version, "expression names", name, f"{len(names)} others")
             matrix[row, names.index(name)] = 1.0

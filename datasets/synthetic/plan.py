@@ -25,12 +25,11 @@ from .hair import STYLES, Style, tracked_volume
 from .parts import MouthPart, procedural_parts, share_that_shows, tongue
 from .performance import (
     HELD_OUT,
-    ICT_TARGETS,
     Kind,
     Performed,
     Translation,
     frames_kept,
-    named_translation,
+    ict_translation,
     perform,
     procedural_translation,
     share_out,
@@ -326,7 +325,7 @@ def load_geometry(name: str) -> Geometry:
         expected = "ICT-FaceKit, its folder FaceXModel or an npz"
         raise InputError(path, "", expected, f"{', '.join(sorted(content))}", "Or take the procedural head.")
     head = ict_head(path, content)
-    translation = named_translation(head, expression_names(content), ICT_TARGETS)
+    translation = ict_translation(head, expression_names(content))
 
     def mouth(person: Person, anatomy: Anatomy, shape: FloatArray) -> Sequence[MouthPart]:
         return (tongue(person, anatomy, len(head.parents)),)

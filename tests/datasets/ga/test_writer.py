@@ -121,21 +121,12 @@ def test_metadata_waits_for_every_image_in_its_size(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "key"),
-    [
-        ({"subject": "a_b"}, "subject"),
-        ({"test_sequences": ("HAIR",)}, "test_sequences"),
-        ({"test_sequences": ("FREE", "EMO-1-shout+laugh", "SEN-01-cramp_small_danger")}, "test_sequences"),
-        ({"novel_view_cameras": ("000000000",)}, "novel_view_cameras"),
-        ({"shape": np.zeros(2)}, "shape"),
-        ({"static_offset": np.zeros((3, 3))}, "static_offset"),
-        ({"cameras": [make_plan().cameras[0]] * 2}, "cameras"),
-    ],
+    "change",
+    [{"subject": "a_b"}, {"test_sequences": ("FREE", "EMO-1-shout+laugh", "SEN-01-cramp_small_danger")}],
 )
-def test_a_plan_that_does_not_hold_together_is_refused(change, key):
-    with pytest.raises(InputError) as error:
+def test_what_the_layout_cannot_hold_is_refused(change):
+    with pytest.raises(InputError, match=next(iter(change))):
         make_plan(**change)
-    assert error.value.key == key
 
 
 def test_a_union_joins_sequences_with_absolute_paths(capture):

@@ -21,7 +21,6 @@ from headbench.datasets.head.ict import (
 )
 from headbench.datasets.head.loaders import load_head
 from headbench.datasets.head.model import HeadModel
-from headbench.datasets.head.teeth import with_teeth
 
 FILE = Path(__file__).parents[4] / "shared" / "data" / "ict_facekit" / "ict_facekit_f16.npz"
 
@@ -124,8 +123,6 @@ def test_regions(head):
     left = head.template[head.regions["left_ear"], 0]
     assert left.min() > 0.05
     assert abs(len(regions["left_ear"]) - len(regions["right_ear"])) < 5  # the kit is symmetric
-    with pytest.raises(InputError, match="without teeth"):
-        with_teeth(head)
 
 
 BAD = {

@@ -35,12 +35,8 @@ from headbench.datasets.inspect.figure import (
 )
 from headbench.datasets.inspect.statistics import expression_space
 from headbench.datasets.steps.figures import (
-    cluster_colour,
-    draw_meshes,
-    draw_strips,
     find_jaw_bases,
     frontal_key,
-    unposed_meshes,
 )
 
 from ..lint.good_capture import FRONTAL, read_rgb
@@ -88,16 +84,6 @@ def head(clip):
     vertices = clip.head.template
     face = clip.head.regions["face"]
     return vertices, clip.head.faces, head_frame(vertices, clip.head.template, face)
-
-
-def test_the_head_frame_undoes_a_rigid_motion(clip):
-    template = clip.head.template
-    angle = 0.7
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    moved = template @ turn.T + [0.3, -0.2, 0.1]
-    frame = head_frame(moved, template, np.arange(len(template)))
-    back = moved @ frame[:3, :3].T + frame[:3, 3]
-    assert back == pytest.approx(template - template.mean(axis=0), abs=1e-12)
 
 
 @pytest.mark.parametrize("above", [True, False])
@@ -182,21 +168,6 @@ def test_jaw_numbers_are_those_of_brute_force():
     assert np.abs(published.angles[0]).max() == pytest.approx(180)
 
 
-def test_unposed_meshes_know_no_rigid_motion_but_the_jaw():
-    clip = make_clip(3)
-    poses = [
-        clip.poses[0],
-        replace(clip.poses[0], rotation=np.ones(3), neck=np.ones(3), translation=np.ones(3)),
-    ]
-    meshes = unposed_meshes(clip, [*poses, replace(poses[0], jaw=poses[0].jaw + [0.3, 0, 0])])
-    # Rows of a batch round alike on some processors only.
-    np.testing.assert_allclose(meshes[0], meshes[1], rtol=0, atol=1e-8)
-    first, second, third = draw_meshes(clip, meshes, 40, 50)
-    np.testing.assert_array_equal(first, second)
-    assert (first != third).any()
-    assert first.shape == (50, 40, 3)
-
-
 def test_the_medoids_camera_is_the_one_the_face_looks_at(clip):
     timestep = clip.timesteps("train")[0]
     cameras = {key.camera for key in clip.splits["train"] if key.timestep == timestep}
@@ -208,26 +179,6 @@ def test_the_medoids_camera_is_the_one_the_face_looks_at(clip):
             clip, rotation=lambda t, turn=turn: turn.as_rotvec(), translation=lambda t: np.zeros(3)
         )
         assert frontal_key(looking, timestep).camera == name
-
-
-def test_strips_show_the_cluster_of_each_timestep_in_order():
-    with new_figure(6, 2) as figure:
-        axes = figure.subplots()
-        draw_strips(axes, {"EMO-1": [0, 0, 1, 2], "SEN": [1, 0]})
-        axes.axis("off")
-        axes.set_title("")
-        axes.set_position((0, 0, 1, 1))
-        picture = pixels(figure) / 255
-    for row, ranks in ((50, [0, 0, 1, 2]), (150, [1, 0])):
-        for number, rank in enumerate(ranks):
-            np.testing.assert_allclose(picture[row, 75 + 150 * number], cluster_colour(rank), atol=0.01)
-    assert (picture[150, 350:] == 1).all()
-
-
-def test_colours_of_sixteen_clusters_differ():
-    colours = 255 * np.array([cluster_colour(rank) for rank in range(16)])
-    distances = np.linalg.norm(colours[:, None] - colours, axis=2) + 1e3 * np.eye(16)
-    assert distances.min() > 20
 
 
 @pytest.mark.commands

@@ -209,10 +209,6 @@ def test_wrong_sizes_are_refused():
     plan = Alignment.of((30, 20), ResolutionRule(multiply=2))
     with pytest.raises(InputError, match="render, size: expected 60x40, found 30x20"):
         plan.restore(np.zeros((20, 30, 3), np.float32), WHITE)
-    with pytest.raises(InputError, match="camera c"):
-        plan.camera(view())
-    with pytest.raises(InputError, match="at least 50 pixels"):
-        Alignment.of((30, 60), ResolutionRule(divide=50))
 
 
 # ------------------------------------------------------------------ clips

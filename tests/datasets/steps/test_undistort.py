@@ -1,5 +1,7 @@
 """Undistortion against pycolmap, and on images with a known content."""
 
+from pathlib import Path
+
 import numpy as np
 import pycolmap
 import pytest
@@ -71,18 +73,19 @@ def test_what_folds_back_is_put_outside():
     assert (image[radius > turning + 0.05] == 1).all()
 
 
-def test_lenses_that_are_none_or_do_not_fit_are_refused(clip):
-    for model, parameters in (
-        ("THIN_PRISM_FISHEYE", (1.0,) * 12),
-        ("RADIAL", (600.0, 1.0, 2.0)),
-        ("RADIAL", (600.0, 1.0, 2.0, np.nan, 0.0)),
-        ("PINHOLE", (600.0, 0.0, 2.0, 1.0)),
-    ):
-        with pytest.raises(InputError):
-            Lens(model, parameters, WIDTH, HEIGHT)
-    for name, size in (("x", (48, 64)), (next(iter(clip.cameras)), (WIDTH, HEIGHT))):
-        with pytest.raises(InputError, match=name):
-            undistort_clip(clip, {name: Lens("RADIAL", LENSES["RADIAL"], *size)})
+@pytest.mark.parametrize(
+    ("model", "params", "width"),
+    [
+        ("THIN_PRISM_FISHEYE", (1.0,) * 12, WIDTH),
+        ("RADIAL", (600.0, 1.0, 2.0), WIDTH),
+        ("RADIAL", (600.0, 1.0, 2.0, np.nan, 0.0), WIDTH),
+        ("PINHOLE", (600.0, 0.0, 2.0, 1.0), WIDTH),
+        ("PINHOLE", (600.0, 600.0, 2.0, 1.0), 0),
+    ],
+)
+def test_lenses_that_are_none_are_refused(model, params, width):
+    with pytest.raises(InputError, match="cameras.txt, camera 1"):
+        Lens(model, params, width, HEIGHT).check(Path("cameras.txt"), "camera 1")
 
 
 # ------------------------------------------------------------------ clips

@@ -68,7 +68,7 @@ def test_other_settings_are_refused(capture, tmp_path):
     (half / "synthesis.json").write_bytes((capture[0] / "synthesis.json").read_bytes())
     with pytest.raises(InputError, match="found none that is whole"):
         synthesize(tmp_path / "third", **SMALL, tracking_error=1.0, pictures=half)
-    for name in ("thesis.txt", "README.txt", ".hidden"):
+    for name in ("thesis.txt", ".hidden"):
         foreign = tmp_path / f"of {name}"
         foreign.mkdir()
         (foreign / name).write_text("irreplaceable")
@@ -105,7 +105,7 @@ def test_a_subject_that_fails_is_named_with_its_log(tmp_path, monkeypatch):
         synthesize(tmp_path, **SMALL, execution=once)
 
 
-@pytest.mark.parametrize("left", [["README.txt"], [".tmp-headbench-a.json"], ["synthesis.json"], []])
+@pytest.mark.parametrize("left", [[".tmp-headbench-a.json"], ["synthesis.json"], []])
 def test_a_start_killed_before_the_first_image_is_resumed(capture, tmp_path, monkeypatch, left):
     class Planned(Exception):
         pass
