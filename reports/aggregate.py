@@ -11,15 +11,16 @@ from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import Literal
-
-import pandas as pd
+from typing import TYPE_CHECKING, Literal
 
 from ..bench.engine.config import CODED
 from ..bench.errors import InputError
 from ..bench.manifest import Manifest, MethodRecord
 from ..bench.rows import ALL, FRAME, FULL, LEFT_OUT, SUSPECT, Row, Rows
 from ..bench.specs import ACTING, DYNAMIC, OFF, MetricSpec
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 AVERAGED = "frames, then sequences, then subjects"
 

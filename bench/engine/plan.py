@@ -9,9 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from ..condition import PLAIN, Condition, label_of
 from ..contracts import Avatar, CheckedMethod, Clip, FrameKey, Progress
@@ -39,6 +37,9 @@ from .config import ResolvedMethod, RunConfig, RunOptions, resolve_cells, resolv
 from .scoring import TrainingView, check_regions
 from .store import Cell, CellRecord, RunFolder
 from .stored import AVATAR_FILE
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 RESULT_FORMAT = 1  # raise when the output of a stage changes
 TRAINING, RENDERING, MEASURING_AVATAR = "training", "rendering", "measuring the avatar"

@@ -14,16 +14,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from statistics import fmean, stdev
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
 from ...bench.progress import counted
 from ...bench.rows import FRAME, Rows
 from ..aggregate import subject_means, summarise, whole_images
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LEVEL = 0.05
 LEAST_SUBJECTS = 3
