@@ -24,8 +24,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args
 
 from .errors import EXIT_CODES, ExitCode, HeadbenchError, InputError, Interruption
-from .machine import limit_threads
-from .process import environment_variable
+from .machine import environment_variable, limit_threads
 from .registry import Plugin, discover, get, resolve
 from .specs import COMMAND_GROUPS, HELP, CommandSpec
 from .terminal import prepare_streams, show, wrapped
@@ -227,7 +226,6 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
 
     from .io.files import check_kind, to_jsonable
     from .io.lock import locked
-    from .options import check_dependent
     from .progress import log_to_terminal, progress
 
     try:
@@ -243,7 +241,10 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
         return lambda: run(settings, json)
 
     def run(settings: Any, json: bool) -> int:
-        check_dependent(getattr(settings_class, "dependent", ()), settings)
+        if dependent := getattr(settings_class, "dependent", ()):
+            from .options import check_dependent
+
+            check_dependent(dependent, settings)
         folder = getattr(settings, spec.writes) if spec.writes else None
         if folder:
             check_kind(Path(folder), *spec.kinds)

@@ -39,12 +39,11 @@ from .io.files import (
     removed_if_empty,
 )
 from .io.lock import locked
-from .listing import presets_of_methods
 from .machine import check_device, processor_count
 from .progress import counted, log_to_file
 from .progress import progress as show_progress
 from .protocol import check_capture, needed
-from .registry import get, resolve
+from .registry import discover, get, resolve
 from .specs import CommandResult, command
 
 if TYPE_CHECKING:
@@ -130,6 +129,16 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
         seconds = round(time.perf_counter() - start, 3)
         result = _result(run_comparison(comparison, execution, capture_seconds=seconds))
     return result._replace(text=f"{result.text}\n{ONE_SUBJECT}")
+
+
+def presets_of_methods() -> str:
+    """A sentence for the help: the presets of every registered method."""
+    methods_by_presets: dict[str, list[str]] = {}
+    for name, plugin in discover("methods").items():
+        if plugin.spec is not None and plugin.spec.presets:
+            methods_by_presets.setdefault(", ".join(plugin.spec.presets), []).append(name)
+    each = (f"{', '.join(methods)}: {presets}" for presets, methods in methods_by_presets.items())
+    return f"Presets by method: {'; '.join(each)}. `headbench list presets` prints their settings."
 
 
 @dataclass(frozen=True)

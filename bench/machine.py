@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -51,6 +51,21 @@ def limit_threads() -> None:
     """Let OpenMP, and with it torch and the kernels, use only as many threads as the quota allows; before torch is imported."""
     if processor_count() < _allowed_cores():
         os.environ.setdefault("OMP_NUM_THREADS", str(processor_count()))
+
+
+@contextmanager
+def environment_variable(name: str, value: str | None) -> Iterator[None]:
+    """Set an environment variable within the block, unless ``value`` is None; afterwards it is as before."""
+    before = os.environ.get(name)
+    if value is not None:
+        os.environ[name] = value
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ[name] = before
+        elif value is not None:
+            del os.environ[name]
 
 
 def _allowed_cores() -> int:

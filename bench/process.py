@@ -11,7 +11,7 @@ import subprocess
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -71,21 +71,6 @@ def described(code: int) -> str:
 def environment(more: Mapping[str, str] | None = None) -> dict[str, str]:
     """Environment variables of a program."""
     return {name: os.environ[name] for name in KEPT if name in os.environ} | GIVEN | dict(more or {})
-
-
-@contextmanager
-def environment_variable(name: str, value: str | None) -> Iterator[None]:
-    """Set an environment variable within the block, unless ``value`` is None; afterwards it is as before."""
-    before = os.environ.get(name)
-    if value is not None:
-        os.environ[name] = value
-    try:
-        yield
-    finally:
-        if before is not None:
-            os.environ[name] = before
-        elif value is not None:
-            del os.environ[name]
 
 
 def run_program(

@@ -21,8 +21,7 @@ from ..errors import HeadbenchError
 from ..io.documents import checked, read_json
 from ..io.files import write_json
 from ..io.lock import locked
-from ..machine import processor_count
-from ..process import environment_variable
+from ..machine import environment_variable, processor_count
 from ..progress import TasksLeft, progress
 from ..registry import resolve
 from ..specs import CommandResult

@@ -12,9 +12,8 @@ import tyro
 
 from ..configuration import build, merge, parse_assignments
 from ..errors import UnavailableError, install_extra
-from ..machine import check_device
+from ..machine import check_device, environment_variable
 from ..options import DependentOptions, check_dependent
-from ..process import environment_variable
 from ..registry import unknown
 
 ExecutorName = Literal["inline", "processes", "slurm"]

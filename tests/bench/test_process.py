@@ -8,7 +8,8 @@ import time
 import psutil
 import pytest
 
-from headbench.bench.process import LONGEST_LOG, ProgramError, environment_variable, run_program
+from headbench.bench.machine import environment_variable
+from headbench.bench.process import LONGEST_LOG, ProgramError, run_program
 
 LEAVES = """
 import subprocess, sys
