@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ..configuration import build
+from ..engine.store import TaskOutcome, read_outcome, update_record
 from ..errors import HeadbenchError
 from ..io.documents import checked, read_json
 from ..io.files import write_json
@@ -28,24 +29,13 @@ from ..specs import CommandResult
 from ..start import end_with_parent, starting_workers
 from .settings import Execution, ExecutionOptions, check_executor
 from .slurm import Slurm
-from .task import (
-    TASK_LOG,
-    Executor,
-    Task,
-    TaskOutcome,
-    TaskResult,
-    execute_task,
-    forget_outcome,
-    read_outcome,
-    update_record,
-)
+from .task import DAMAGED, TASK_LOG, Executor, Task, TaskResult, execute_task, forget_outcome
 
 POLL_S = 1.0
 """Seconds between updates of the progress."""
 RESULT = "result.json"
 PLACE = "command"
 log = logging.getLogger(__name__)
-DAMAGED = "its results are missing or damaged"
 Failures = dict[str, str]
 """Reasons of failed tasks, by their folder."""
 

@@ -23,6 +23,9 @@ from ..errors import HeadbenchError, InputError, UnavailableError
 MAX_NAME_BYTES = 120
 """Maximum length of a subject, sequence or camera name; file names combine several and are limited to 255 bytes."""
 
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""System errors that would affect every other file, too."""
+
 ROOM_BYTES = 64 * 2**10
 """Less free space than this counts as a full disk."""
 
@@ -300,7 +303,7 @@ def reading(path: str | os.PathLike[str], expected: str, key: str = "", remedy: 
     except HeadbenchError:
         raise
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if isinstance(error, OSError) and error.errno in FULL_DISK:
             raise
         raise InputError(path, key, expected, _words(error), remedy) from error
 
