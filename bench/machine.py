@@ -26,7 +26,7 @@ from .specs import MAX_LABEL
 OPENCV = "opencv-contrib-python-headless"
 RECORDED_PACKAGES = ("headbench", "torch", "gsplat", "numpy", OPENCV, "scikit-image")
 ACCELERATOR_FIELDS = ("name", "driver_version", "memory.total", "power.limit", "clocks.sm", "clocks.max.sm")
-RUSAGE_UNIT = 1 if sys.platform == "darwin" else 1024
+RUSAGE_UNIT = 1024
 STATUS, RESET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 CGROUPS, OWN_CGROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
@@ -69,8 +69,7 @@ def environment_variable(name: str, value: str | None) -> Iterator[None]:
 
 
 def _allowed_cores() -> int:
-    available = getattr(os, "sched_getaffinity", None)  # not on every system
-    return len(available(0)) if available else os.cpu_count() or 1
+    return len(os.sched_getaffinity(0))
 
 
 def _cgroup_limits(controller: str, *names: str) -> Iterator[list[str]]:
@@ -328,14 +327,10 @@ def _busy_seconds() -> float | None:
     """Total busy time of the cores that this process may use; None if the system does not report it."""
     import psutil
 
-    try:
-        cores = psutil.cpu_times(percpu=True)
-    except (OSError, psutil.Error):
-        return None
+    cores = psutil.cpu_times(percpu=True)
     if not any(sum(core) for core in cores):
         return None
-    available = getattr(os, "sched_getaffinity", None)
-    allowed = available(0) if available else range(len(cores))
+    allowed = os.sched_getaffinity(0)
     # If some cores are offline, positions do not identify cores: use all.
     chosen = [cores[index] for index in allowed] if max(allowed) < len(cores) else cores
     return float(sum(getattr(core, name, 0.0) for core in chosen for name in BUSY))

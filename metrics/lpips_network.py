@@ -1,7 +1,7 @@
 """The network of LPIPS: `Lpips`, its feature networks, and the location of their weights.
 
 The feature networks are the convolutional parts of AlexNet (Krizhevsky, "One weird trick for parallelizing convolutional
-neural networks", 2014), SqueezeNet 1.1 (Iandola et al., 2016) and VGG-16 (Simonyan, Zisserman, 2015, configuration D),
+neural networks", 2014) and VGG-16 (Simonyan, Zisserman, 2015, configuration D),
 with torchvision's parameter names, so that its published weights load as they are.
 
 The linear layers (version 0.1 of Zhang et al. 2018) come with the installed torchmetrics package, whose files
@@ -17,7 +17,7 @@ In a folder, the published file name, or the name of a file with only the convol
 
 Formats read:
 
-- Weights of AlexNet, SqueezeNet and VGG-16 (`alexnet-owt-7be5be79.pth` and the like). Written by pytorch/vision. Not checked on
+- Weights of AlexNet and VGG-16 (`alexnet-owt-7be5be79.pth` and the like). Written by pytorch/vision. Not checked on
   a file of the program.
 - Linear layers of LPIPS 0.1. Written by richzhang/PerceptualSimilarity. Checked on the files in torchmetrics' package, with the
   scores of the package lpips 0.1.4 for richzhang/PerceptualSimilarity@082bb24f `imgs`.
@@ -47,7 +47,7 @@ from torch.nn import functional
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.errors import InputError, UnavailableError
 from ..bench.io.arrays import check_numbers
-from ..bench.io.files import atomic_path, cache_folder, digest, open_regular, reading
+from ..bench.io.files import atomic_path, cache_folder, open_regular, reading
 from .psnr import check_pair
 
 EXPECTED = "a PyTorch file of weights"
@@ -93,12 +93,11 @@ NO_WEIGHTS = "LPIPS: weights missing, see headbench doctor"
 class Lpips:
     """LPIPS with its weights loaded, ready to compare frames.
 
-    - ``net``: "alex" (the usual choice for evaluation), "squeeze" or "vgg".
+    - ``net``: "alex" (the usual choice for evaluation) or "vgg".
     - ``weights``: file of the backbone, or folder to look in; see the module for the default.
     - ``device``: device of the network, which always computes in float32.
     - ``scaled``: whether to scale images to [-1, 1], as the constants expect; False feeds [0, 1].
     - ``cache_mb``: maximum memory for cached features of ground-truth images, which the next method reuses, in 10^6 bytes.
-    - ``fingerprint``: hex digest of all weights in use, the same for a full file and one with only the convolutional part.
     """
 
     def __init__(
@@ -118,7 +117,6 @@ class Lpips:
         self._cache_bytes, self._held = int(cache_mb * 1e6), 0
         backbone = load_backbone(self.spec, find_backbone(self.spec, weights))
         linear = load_linear(self.spec)
-        self.fingerprint = digest(*(value.numpy() for value in (*backbone.values(), *linear)))
         self.device = torch.device(device)
         self._network = self.spec.build()
         self._network.load_state_dict(backbone)
@@ -189,21 +187,6 @@ class Lpips:
         return [out.div_(out.square().sum(dim=1, keepdim=True).sqrt_() + EPSILON) for out in outputs]
 
 
-class Fire(nn.Module):
-    """SqueezeNet's fire module: a 1 x 1 squeeze, then parallel 1 x 1 and 3 x 3 expansions."""
-
-    def __init__(self, inputs: int, squeeze: int, expand: int) -> None:
-        super().__init__()
-        self.squeeze = nn.Conv2d(inputs, squeeze, 1)
-        self.expand1x1 = nn.Conv2d(squeeze, expand, 1)
-        self.expand3x3 = nn.Conv2d(squeeze, expand, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map (N, inputs, H, W) to (N, 2 expand, H, W)."""
-        x = torch.relu(self.squeeze(x))
-        return torch.relu(torch.cat([self.expand1x1(x), self.expand3x3(x)], dim=1))
-
-
 class TappedNetwork(nn.Module):
     """A chain of layers that also returns the outputs of some of them."""
 
@@ -239,14 +222,12 @@ class NetworkSpec:
 
     def build(self) -> TappedNetwork:
         """Create the network with uninitialised weights."""
-        return {"alex": _alexnet, "squeeze": _squeezenet, "vgg": _vgg16}[self.name]()
+        return {"alex": _alexnet, "vgg": _vgg16}[self.name]()
 
 
 ALEX = NetworkSpec("alex", (64, 192, 384, 256, 256), 31, "alexnet-owt-7be5be79.pth", "alexnet_features.pth")
-_SQUEEZE_FILES = "squeezenet1_1-b8a52dc0.pth", "squeezenet1_1_features.pth"
-SQUEEZE = NetworkSpec("squeeze", (64, 128, 256, 384, 384, 512, 512), 17, *_SQUEEZE_FILES)
 VGG = NetworkSpec("vgg", (64, 128, 256, 512, 512), 16, "vgg16-397923af.pth", "vgg16_features.pth")
-NETWORKS = {spec.name: spec for spec in (ALEX, SQUEEZE, VGG)}
+NETWORKS = {spec.name: spec for spec in (ALEX, VGG)}
 
 
 def _rectified(*sizes: int) -> list[nn.Module]:
@@ -264,17 +245,6 @@ def _alexnet() -> TappedNetwork:
     for inputs, outputs in ((192, 384), (384, 256), (256, 256)):
         layers += _rectified(inputs, outputs, 3, 1, 1)
     return TappedNetwork(layers, (1, 4, 7, 9, 11))
-
-
-def _squeezenet() -> TappedNetwork:
-    layers = _rectified(3, 64, 3, 2)
-    for fires in (
-        [(64, 16, 64), (128, 16, 64)],
-        [(128, 32, 128), (256, 32, 128)],
-        [(256, 48, 192), (384, 48, 192), (384, 64, 256), (512, 64, 256)],
-    ):
-        layers += [nn.MaxPool2d(3, 2, ceil_mode=True), *(Fire(*sizes) for sizes in fires)]
-    return TappedNetwork(layers, (1, 4, 7, 9, 10, 11, 12))
 
 
 def _vgg16() -> TappedNetwork:

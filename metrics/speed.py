@@ -231,7 +231,7 @@ def measure_speed(
         "static_ms": float(np.median(static)),
         "warm_up_frames": warm_up_frames,
         "stationary": float(stationary),
-        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan"),
+        "load": os.getloadavg()[0],
     }
     return Measurement(1000 / details["mean_ms"], {k: v for k, v in details.items() if np.isfinite(v)})
 

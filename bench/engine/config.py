@@ -17,7 +17,7 @@ from ..condition import PLAIN, Condition, Named, label_of
 from ..configuration import build, build_arguments, deciding_settings, merge, setting_paths
 from ..contracts import Budget, TaskName
 from ..errors import InputError
-from ..io.files import check_name, check_utf8
+from ..io.files import check_name
 from ..registry import code_digest, discover, forget_code, get, is_outside, resolve, unknown
 from ..specs import ConditionSpec, MethodSpec, MetricSpec, ProfileSpec
 
@@ -132,9 +132,7 @@ def build_run_config(values: Mapping[str, Any], source: str) -> RunConfig:
                 raise InputError(
                     source, key, "a setting of a run", repr(key), f"Did you mean {places[near[0]]}?"
                 )
-    config = build(RunConfig, values, source)
-    check_utf8(config.data, source, "data", "a path")
-    return config
+    return build(RunConfig, values, source)
 
 
 def _setting_places() -> dict[str, str]:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Protocol
 
 from ..engine.store import TaskOutcome, read_outcome, update_record
 from ..errors import reason_of
-from ..io.files import FULL_DISK, no_link, output_inside
+from ..io.files import FULL_DISK
 from ..io.lock import locked
 from ..machine import check_device, machine_record
 from ..progress import log_to_file
@@ -115,7 +115,7 @@ def execute_task(task: Task) -> None:
         "host": platform.node(),
         "threads": os.environ.get("OMP_NUM_THREADS", ""),
     }
-    with output_inside(Path(task.root)), locked(folder), _output_to(folder), log_to_file(folder / TASK_LOG):
+    with locked(folder), _output_to(folder), log_to_file(folder / TASK_LOG):
         before = 0.0
         first = read_outcome(folder) if task.speed else None
         if first is not None and not first["speed"]:
@@ -153,7 +153,7 @@ def _output_to(folder: Path) -> Iterator[None]:
     sys.stdout.flush()
     sys.stderr.flush()
     before = [os.dup(number) for number in (1, 2)]
-    with open(folder / TASK_LOG, "a", encoding="utf-8", opener=no_link) as stream:
+    with open(folder / TASK_LOG, "a", encoding="utf-8") as stream:
         for number in (1, 2):
             os.dup2(stream.fileno(), number)
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -21,7 +20,7 @@ from ..engine.run import run
 from ..engine.store import RunFolder
 from ..errors import UnavailableError
 from ..executors.settings import ExecutionOptions, check_executor
-from ..io.files import check_kind, digest, output_inside, write_json
+from ..io.files import check_kind, digest, write_json
 from ..io.lock import locked
 from ..protocol import Protocol
 from ..registry import get, resolve
@@ -162,7 +161,7 @@ def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) ->
     source.read_manifest()  # before a folder is created
     out = Path(settings.out) if settings.out else source.root / task
     check_kind(out, "a run")
-    with nullcontext() if settings.out else output_inside(source.root), locked(out):
+    with locked(out):
         config, jobs = trained(source.root, settings.methods, settings, out)
         check_executor(execution, config.device)
         config = replace(
