@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import tyro
-from scipy.special import ndtri
 
 from ..condition import Condition, Named
 from ..contracts import Avatar, Clip, DepthAvatar, FloatArray, FrameKey, HeadPose, Progress, no_progress
@@ -260,6 +259,8 @@ def joint_samples(count: int, dimensions: int, sigmas: float) -> FloatArray:
     In each dimension, the values are the middle quantiles of ``count`` parts of equal probability, in random order
     (McKay, Beckman, Conover, Technometrics 21(2), 1979).
     """
+    from scipy.special import ndtri  # which help does without
+
     rng = np.random.default_rng(0)
     parts = np.stack([rng.permutation(count) for _ in range(dimensions)], axis=1)
     return np.asarray(np.clip(ndtri((parts + 0.5) / count), -sigmas, sigmas))

@@ -70,8 +70,6 @@ def turntable(
     beyond_degrees : float
         Maximum angle of views beyond the outermost cameras on either side, in [0, 180).
     """
-    if not cameras:
-        raise InputError("turntable", "cameras", "at least one", "none")
     first = cameras[0]
     sized = [camera.resized(first.width, first.height) for camera in cameras]
     focal = np.array([[camera.K[0, 0], camera.K[1, 1]] for camera in sized])

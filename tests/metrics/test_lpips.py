@@ -252,8 +252,6 @@ def test_frames_a_network_cannot_see_have_no_value(random_weights):
     small = frames(1, (30, 64))[0]
     with pytest.raises(UnavailableError, match="at least 31 x 31 pixels; these have 64 x 30"):
         metric(small, small)
-    with pytest.raises(InputError, match="two stacks"):
-        metric.distances(frames(2), frames(3))
 
 
 def test_without_weights_every_call_is_unavailable_asking_once(bare_machine):
