@@ -7,7 +7,6 @@ Light to import: the parser and the settings of a command are loaded on demand.
 
 import difflib
 import errno
-import inspect
 import json as json_module
 import os
 import re
@@ -16,7 +15,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -24,8 +23,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args
 
 from .errors import EXIT_CODES, ExitCode, HeadbenchError, InputError, Interruption
-from .machine import limit_threads
-from .process import environment_variable
+from .machine import environment_variable, limit_threads
 from .registry import Plugin, discover, get, resolve
 from .specs import COMMAND_GROUPS, HELP, CommandSpec
 from .terminal import prepare_streams, show, wrapped
@@ -88,7 +86,7 @@ def main(arguments: list[str] | None = None) -> int:
             return ExitCode.OK  # `headbench --help | head -1`: not an error
         finally:
             show(end="")  # flush buffered output while errors can still be reported
-    except SystemExit as exited:  # of the parser: help, completion, wrong usage
+    except SystemExit as exited:  # of the parser: help, wrong usage
         return int(exited.code or ExitCode.OK)
     except HeadbenchError as error:
         return _fail(str(error), ExitCode.BAD_INPUT)
@@ -138,18 +136,13 @@ def _call(words: list[str]) -> int:
         show(wrapped(START))
         return ExitCode.OK
     plugins = discover("commands")
-    if words[0].startswith("--tyro-"):
-        run: Callable[[], int] = _parse(
-            _all_commands(plugins), "headbench", words
-        )  # prints or writes completion
-        return run()
     if words[0] in HELP:
         show(wrapped(help_page(plugins)))
         return ExitCode.OK
     name = next((name for name in (" ".join(words[:2]), words[0]) if name in plugins), "")
     if name:
         words = [with_home(word) for word in words[len(name.split()) :]]
-        run = _parse(_command(name, plugins[name], words), f"headbench {name}", words)
+        run: Callable[[], int] = _parse(_command(name, plugins[name], words), f"headbench {name}", words)
         return run()
     table = {name: plugin for name, plugin in plugins.items() if name.partition(" ")[0] == words[0]}
     if table and words[1:2] and words[1] in HELP:
@@ -227,7 +220,6 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
 
     from .io.files import check_kind, to_jsonable
     from .io.lock import locked
-    from .options import check_dependent
     from .progress import log_to_terminal, progress
 
     try:
@@ -243,7 +235,10 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
         return lambda: run(settings, json)
 
     def run(settings: Any, json: bool) -> int:
-        check_dependent(getattr(settings_class, "dependent", ()), settings)
+        if dependent := getattr(settings_class, "dependent", ()):
+            from .options import check_dependent
+
+            check_dependent(dependent, settings)
         folder = getattr(settings, spec.writes) if spec.writes else None
         if folder:
             check_kind(Path(folder), *spec.kinds)
@@ -269,37 +264,6 @@ def _command(name: str, plugin: Plugin, words: Sequence[str]) -> Command:
         "\n\n".join(part for part in parts if part) + "\n\nArgs:\n    json: Print the result as JSON."
     )
     return command
-
-
-def _all_commands(plugins: Mapping[str, Plugin]) -> Command:
-    """All commands as nested subcommands, for completion. Commands that cannot be loaded are left out."""
-    groups: dict[str, dict[str, Command]] = {}
-    for name, plugin in sorted(plugins.items()):
-        first, _, second = name.partition(" ")
-        with suppress(HeadbenchError):
-            groups.setdefault(first, {})[second] = _command(name, plugin, ())
-    return _nested({first: _nested(seconds) for first, seconds in groups.items()})
-
-
-def _nested(group: Mapping[str, Command]) -> Command:
-    """Commands as subcommands of one; a command without a name adds its options to this level."""
-    import tyro
-
-    # Not tyro's function for subcommands: it searches typing's sources for help, which doubles the time.
-    command_of_level = group.get("")
-    words = {name: command for name, command in group.items() if name}
-    if command_of_level is not None and not words:
-        return command_of_level
-    choices = [Annotated[Any, tyro.conf.subcommand(name=n, constructor=c)] for n, c in words.items()]
-    choice: Any = Union[(*choices, Annotated[None, tyro.conf.Suppress])]
-
-    def chosen(command: choice) -> Callable[[], int]:
-        return command
-
-    if command_of_level is not None:
-        chosen.__annotations__ = {"command": choice, "settings": command_of_level.__annotations__["settings"]}
-        chosen.__signature__ = inspect.signature(lambda command, settings: None)  # type: ignore[attr-defined]
-    return chosen
 
 
 def _parts(words: Sequence[str], kind: Callable[[str], Any]) -> tuple[Any, ...]:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
@@ -19,13 +19,12 @@ from .condition import PLAIN
 from .configuration import build, merge, parse_assignments, with_homes
 from .contracts import Progress
 from .engine.config import (
-    QUICK,
-    DemoConfig,
     RunConfig,
     RunOptions,
     build_run_config,
     coded_conditions,
-    demo_run_config,
+    default_names,
+    parse_size,
     resolve_methods,
     resolve_metrics,
     with_methods,
@@ -39,12 +38,11 @@ from .io.files import (
     removed_if_empty,
 )
 from .io.lock import locked
-from .listing import presets_of_methods
 from .machine import check_device
 from .progress import counted, log_to_file
 from .progress import progress as show_progress
 from .protocol import check_capture, needed
-from .registry import get, resolve
+from .registry import discover, get, resolve
 from .specs import CommandResult, command
 
 if TYPE_CHECKING:
@@ -53,6 +51,72 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 Preset = Literal["quick", "smoke", "demo", "fast", "paper"]
+QUICK: Final = "quick"
+"""Preset of the demo: about 3 minutes on two cores, with fewer scored frames, without coded avatars and speeds."""
+QUICK_FRAMES = 23
+"""Number of scored frames of a task: a prime, so that evenly spaced ones are of all 8 cameras."""
+DEMO_SIZES: Mapping[str, Mapping[str, Any]] = {
+    "smoke": {"cameras": 3, "timesteps": 8, "size": "48x64"},
+    QUICK: {"cameras": 8, "timesteps": 16, "size": "120x174"},
+    "demo": {"cameras": 12, "timesteps": 28, "size": "144x208"},
+}
+"""Sizes of the demo's capture by preset; other presets have those of "demo"."""
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Settings of ``headbench demo``. Sizes that are None are those of the preset, see `DEMO_SIZES`."""
+
+    out: str = "demo-output"
+    preset: str = QUICK
+    seed: int = 0  # of the training
+    subject_seed: int = 14  # of the capture: determines the subject and the performance
+    cameras: int | None = None
+    timesteps: int | None = None
+    size: str | None = None
+    head: str = "procedural"
+    tracking_noise: float = 0.0
+
+    def capture_arguments(self) -> dict[str, Any]:
+        """Arguments of the synthesiser."""
+        sizes = dict(DEMO_SIZES.get(self.preset, DEMO_SIZES["demo"]))
+        sizes |= {name: value for name in sizes if (value := getattr(self, name)) is not None}
+        return {
+            "out": self.capture_folder,
+            "subjects": 1,
+            **sizes,
+            "size": parse_size(sizes["size"]),
+            "head": self.head,
+            "seed": self.subject_seed,
+            "tracking_noise": self.tracking_noise,
+            "performance": "full",  # which shows most in few timesteps
+        }
+
+    @property
+    def capture_folder(self) -> Path:
+        return Path(self.out) / "capture"
+
+
+def demo_run_config(config: DemoConfig, device: str) -> dict[str, Any]:
+    """`RunConfig` fields of the comparison, with the methods that have the preset and support ``device``."""
+    is_quick = config.preset == QUICK
+    specs = {name: plugin.spec for name, plugin in discover("methods").items() if plugin.spec}
+    methods = tuple(
+        name
+        for name, spec in specs.items()
+        if spec.demo and spec.computes_on(device) and (not spec.presets or config.preset in spec.presets)
+    )
+    return {
+        "data": str(config.capture_folder),
+        "out": config.out,
+        "methods": methods,
+        "preset": config.preset,
+        "seeds": (config.seed,),
+        "frames_per_task": QUICK_FRAMES if is_quick else None,
+        "metrics": tuple(
+            name for name in default_names("metrics") if not (is_quick and get("metrics", name).is_speed)
+        ),
+    }
 
 
 Assignments = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")]
@@ -125,6 +189,16 @@ def demo(settings: DemoSettings, progress: Progress) -> CommandResult:
         seconds = round(time.perf_counter() - start, 3)
         result = _result(run_comparison(comparison, Execution("auto"), capture_seconds=seconds))
     return result._replace(text=f"{result.text}\n{ONE_SUBJECT}")
+
+
+def presets_of_methods() -> str:
+    """A sentence for the help: the presets of every registered method."""
+    methods_by_presets: dict[str, list[str]] = {}
+    for name, plugin in discover("methods").items():
+        if plugin.spec is not None and plugin.spec.presets:
+            methods_by_presets.setdefault(", ".join(plugin.spec.presets), []).append(name)
+    each = (f"{', '.join(methods)}: {presets}" for presets, methods in methods_by_presets.items())
+    return f"Presets by method: {'; '.join(each)}. `headbench list presets` prints their settings."
 
 
 @dataclass(frozen=True)

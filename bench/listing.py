@@ -87,13 +87,3 @@ def _shown(entries: list[dict[str, Any]]) -> CommandResult:
     shown = [f"broken: {entry['error']}" if entry["error"] else entry["summary"] for entry in entries]
     lines = [f"{entry['name']:<{width}}  {text}" for entry, text in zip(entries, shown)]
     return CommandResult("\n".join(lines), entries)
-
-
-def presets_of_methods() -> str:
-    """A sentence for the help: the presets of every registered method."""
-    methods_by_presets: dict[str, list[str]] = {}
-    for name, plugin in discover("methods").items():
-        if plugin.spec is not None and plugin.spec.presets:
-            methods_by_presets.setdefault(", ".join(plugin.spec.presets), []).append(name)
-    each = (f"{', '.join(methods)}: {presets}" for presets, methods in methods_by_presets.items())
-    return f"Presets by method: {'; '.join(each)}. `headbench list presets` prints their settings."

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -51,6 +51,21 @@ def limit_threads() -> None:
     """Let OpenMP, and with it torch and the kernels, use only as many threads as the quota allows; before torch is imported."""
     if processor_count() < _allowed_cores():
         os.environ.setdefault("OMP_NUM_THREADS", str(processor_count()))
+
+
+@contextmanager
+def environment_variable(name: str, value: str | None) -> Iterator[None]:
+    """Set an environment variable within the block, unless ``value`` is None; afterwards it is as before."""
+    before = os.environ.get(name)
+    if value is not None:
+        os.environ[name] = value
+    try:
+        yield
+    finally:
+        if before is not None:
+            os.environ[name] = before
+        elif value is not None:
+            del os.environ[name]
 
 
 def _allowed_cores() -> int:
@@ -319,10 +334,7 @@ def _busy_seconds() -> float | None:
     """Total busy time of the cores that this process may use; None if the system does not report it."""
     import psutil
 
-    try:
-        cores = psutil.cpu_times(percpu=True)
-    except (OSError, psutil.Error):
-        return None
+    cores = psutil.cpu_times(percpu=True)
     if not any(sum(core) for core in cores):
         return None
     available = getattr(os, "sched_getaffinity", None)

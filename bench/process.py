@@ -11,7 +11,7 @@ import subprocess
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -29,8 +29,6 @@ GIVEN = {"PYTHONUNBUFFERED": "1", "PYTHONDONTWRITEBYTECODE": "1", "TQDM_MININTER
 """Additional variables: unbuffered output, and no caches in its folder."""
 
 LAST_LINES, LONGEST_LINE = 12, 2_000
-LONGEST_LOG = 4 * 2**20
-"""Maximum logged bytes of a program's output, from the start; only the last lines of the rest are logged."""
 LEFT_IN_PIPE = 2**20
 """Maximum bytes read after the program has ended; its own output is within the pipe's 64 KiB."""
 REDRAWN_EVERY_S = 30.0
@@ -71,21 +69,6 @@ def described(code: int) -> str:
 def environment(more: Mapping[str, str] | None = None) -> dict[str, str]:
     """Environment variables of a program."""
     return {name: os.environ[name] for name in KEPT if name in os.environ} | GIVEN | dict(more or {})
-
-
-@contextmanager
-def environment_variable(name: str, value: str | None) -> Iterator[None]:
-    """Set an environment variable within the block, unless ``value`` is None; afterwards it is as before."""
-    before = os.environ.get(name)
-    if value is not None:
-        os.environ[name] = value
-    try:
-        yield
-    finally:
-        if before is not None:
-            os.environ[name] = before
-        elif value is not None:
-            del os.environ[name]
 
 
 def run_program(
@@ -151,7 +134,7 @@ def _follow(
     until: float,
 ) -> bool:
     """Log the output of a program until it ends; False if it runs longer than ``until``."""
-    drawn, left_out, limit = -REDRAWN_EVERY_S, 0, log.tell() + LONGEST_LOG
+    drawn = -REDRAWN_EVERY_S
     for line, redrawn in _lines(_output(process, until)):
         on_line(line)
         if last and redrawn and last[-1].split(":")[0] == line.split(":")[0]:
@@ -162,13 +145,8 @@ def _follow(
         if redrawn and now - drawn < REDRAWN_EVERY_S:
             continue
         drawn = now if redrawn else drawn
-        if log.tell() < limit:
-            log.write(line.encode() + b"\n")
-            log.flush()
-        else:
-            left_out += 1
-    if left_out:
-        log.write("\n".join([f"[... {left_out} more lines; the last of them:]", *last, ""]).encode())
+        log.write(line.encode() + b"\n")
+        log.flush()
     return process.poll() is not None
 
 

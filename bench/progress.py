@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Protocol, Self
 
 from .contracts import Progress
-from .io.files import no_link
 from .terminal import wrapped
 
 BAR, ASCII_BAR = "█░", "#."
@@ -147,7 +146,10 @@ def log_to_terminal() -> AbstractContextManager[None]:
 
 def log_to_file(path: Path) -> AbstractContextManager[None]:
     """Append headbench's log, with times, to a file while the block runs."""
-    return _logging(_LogFile(path), "%(asctime)s %(levelname)s %(name)s: %(message)s")
+    return _logging(
+        _LogFile(path, encoding="utf-8", errors="backslashreplace"),
+        "%(asctime)s %(levelname)s %(name)s: %(message)s",
+    )
 
 
 @contextmanager
@@ -166,12 +168,8 @@ def _logging(handler: logging.Handler, form: str) -> Iterator[None]:
         log.propagate = propagate
 
 
-class _LogFile(logging.StreamHandler):
-    """A log file, never written through a link. Failure to write it is an error of the run."""
-
-    def __init__(self, path: Path):
-        self.path = path
-        super().__init__(open(path, "a", encoding="utf-8", errors="backslashreplace", opener=no_link))  # noqa: SIM115
+class _LogFile(logging.FileHandler):
+    """A log file. Failure to write it is an error of the run."""
 
     def handleError(self, record: logging.LogRecord) -> None:
         error = sys.exception()
@@ -180,12 +178,8 @@ class _LogFile(logging.StreamHandler):
                 record
             )  # a malformed message of a plug-in is printed and does not stop the run
             return
-        error.filename = str(self.path)
+        error.filename = self.baseFilename
         raise error
-
-    def close(self) -> None:
-        self.stream.close()
-        super().close()
 
 
 class CellProgress(Protocol):

@@ -322,8 +322,6 @@ def evenly(frames: Sequence[Item], count: int | None) -> list[Item]:
     """At most ``count`` items, from the middles of equal intervals; None: all."""
     if count is None or count >= len(frames):
         return list(frames)
-    if count < 1:
-        raise InputError("protocol", "max_frames", "at least 1", str(count))
     return [frames[(2 * i + 1) * len(frames) // (2 * count)] for i in range(count)]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -10,18 +9,17 @@ from enum import Enum
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import pandas as pd
-import pyarrow.parquet as pq
 
 from .condition import label_of
 from .contracts import IntArray
 from .errors import InputError, shortened
 from .io.files import atomic_path, open_regular, reading
 
-log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    import pandas as pd  # slow to import: commands import it when they have rows
 FRAME = ["subject", "sequence", "timestep", "camera"]
 """Columns that name a frame."""
 FULL = "full"
@@ -72,7 +70,6 @@ TYPES = {
     "threads": "int64",
     "other_cores": "float64",
 }
-TEXTS = tuple(name for name in COLUMNS if name not in TYPES)
 
 ROWS = "a Parquet file of rows"
 JOINED_AT_ONCE = 64
@@ -103,13 +100,17 @@ class Rows:
 
     @classmethod
     def of(cls, rows: Iterable[Row]) -> Rows:
-        """Build rows from measured values."""
-        frame = pd.DataFrame([asdict(row) for row in rows], columns=list(COLUMNS))
-        return cls(frame.astype(TYPES))
+        """Build rows from measured values; long reasons are shortened."""
+        import pandas as pd
+
+        records = ({**asdict(row), "reason": shortened(row.reason, MAX_REASON)} for row in rows)
+        return cls(pd.DataFrame(records, columns=list(COLUMNS)).astype(TYPES))
 
     @classmethod
     def joined(cls, parts: Iterable[Rows]) -> Rows:
         """Concatenate rows, in order."""
+        import pandas as pd
+
         tables = (part._table for part in parts)
         whole = []
         while batch := list(islice(tables, JOINED_AT_ONCE)):
@@ -121,18 +122,15 @@ class Rows:
     @classmethod
     def read(cls, path: Path) -> Rows:
         """Read rows that `write` wrote."""
+        import pandas as pd
+
         if not path.exists():
             raise InputError(path, "", "the rows of a finished run", "no such file", "Start the run again.")
         with open_regular(path, ROWS) as stream, reading(path, ROWS):
-            if lacking := sorted({*COLUMNS} - {*pq.read_schema(stream).names}):
+            table = pd.read_parquet(stream)
+            if lacking := sorted({*COLUMNS} - {*table.columns}):
                 raise InputError(path, "columns", ", ".join(COLUMNS), f"no {', '.join(lacking)}")
-            # Text as dictionaries, so that repeated text takes no memory.
-            file = pq.ParquetFile(stream, read_dictionary=list(TEXTS), pre_buffer=False)
-            table = file.read(columns=list(COLUMNS), use_threads=False, use_pandas_metadata=False)
-            columns = {name: table.column(name).combine_chunks() for name in COLUMNS}
-            texts = {name: _texts(columns.pop(name), name) for name in TEXTS}
-            numbers = {name: column.to_numpy(zero_copy_only=False) for name, column in columns.items()}
-            return cls(pd.DataFrame(numbers | texts, columns=list(COLUMNS)).astype(TYPES))
+            return cls(table[[*COLUMNS]].astype(TYPES))
 
     def write(self, path: Path) -> None:
         """Write the rows as Parquet, atomically."""
@@ -252,10 +250,10 @@ class Rows:
     def labelled(self) -> Rows:
         """Return the rows with the label of method and condition (`label_of`) as the method, as in tables."""
         table = self._table
-        (method, methods), (condition, conditions) = (pd.factorize(table[n]) for n in ("method", "condition"))
-        labels = np.array([[label_of(str(m), str(c)) for c in conditions] for m in methods], dtype=object)
-        labels = labels.reshape(len(methods), len(conditions))[method, condition]  # also works without rows
-        return Rows(table.assign(method=pd.Series(labels, table.index, dtype="str"), condition=""))
+        pairs = table["method"] + "\n" + table["condition"]
+        return Rows(
+            table.assign(method=_mapped(pairs, lambda pair: label_of(*pair.split("\n"))), condition="")
+        )
 
     def in_single_precision(self) -> Rows:
         """Return the rows with values rounded to float32 (7 digits, more than tables show), which halves the file."""
@@ -273,8 +271,8 @@ class Rows:
         if sequences:
             chosen &= table["sequence"].isin(list(sequences))
         chosen &= ~avatar & (table["timestep"] >= 0)
-        measured = pd.MultiIndex.from_frame(table.loc[chosen, ["task", "metric"]])
-        failed = (table["timestep"] < 0) & pd.MultiIndex.from_frame(table[["task", "metric"]]).isin(measured)
+        places = table.set_index(["task", "metric"]).index
+        failed = (table["timestep"] < 0) & places.isin(places[chosen])
         return Rows(table[avatar | chosen | failed].assign(region=full))
 
     def split_by_camera(
@@ -284,10 +282,12 @@ class Rows:
 
         Rows that stand for all frames of the task because a method failed are in both.
         """
+        import pandas as pd
+
         table = self._table
         whole = (table["task"] == task) & (table["timestep"] < 0)
         frames = (table["task"] == task) & ~whole
-        cameras = pd.MultiIndex.from_frame(table.loc[frames, ["subject", "camera"]])
+        cameras = table[frames].set_index(["subject", "camera"]).index
         names = table.loc[~whole, "task"].mask(frames[~whole], outside)
         names[frames[frames].index[cameras.isin(list(chosen))]] = inside
         parts = [table[~whole].assign(task=names.astype("str"))]
@@ -322,8 +322,7 @@ class Rows:
     def with_metrics(self, names: Mapping[str, str]) -> Rows:
         """Return the rows of some metrics, renamed."""
         table = self._table[self._table["metric"].isin(list(names))]
-        renamed = pd.Series([names[str(name)] for name in table["metric"]], table.index, dtype="str")
-        return Rows(table.assign(metric=renamed))
+        return Rows(table.assign(metric=_mapped(table["metric"], names.__getitem__)))
 
     def of_frames(self, tasks: Mapping[str, Collection[tuple[str, str, int, str]]]) -> Rows:
         """The rows of some frames of some tasks, and those of avatars as a whole.
@@ -331,11 +330,9 @@ class Rows:
         Rows that stand for all frames of one of the tasks because a method failed are kept.
         """
         table = self._table
-        kept = table["task"] == ""
+        kept, keys = table["task"] == "", table.set_index(FRAME).index
         for task, frames in tasks.items():
-            of_task = table["task"] == task
-            inside = pd.MultiIndex.from_frame(table[FRAME]).isin(list(frames))
-            kept |= of_task & (inside | (table["timestep"] < 0))
+            kept |= (table["task"] == task) & (keys.isin(list(frames)) | (table["timestep"] < 0))
         return Rows(table[kept])
 
     def as_one_sequence(self) -> Rows:
@@ -346,9 +343,9 @@ class Rows:
         table = self._table
         of_frames = (table["task"] != "") & (table["timestep"] >= 0)
         place = table.loc[of_frames].groupby(["task", "subject"])[["sequence", "timestep"]]
-        numbers = pd.Series(table["timestep"], copy=True)
+        numbers = table["timestep"].copy()
         for _, group in place:
-            order = pd.MultiIndex.from_frame(group)
+            order = group.set_index(["sequence", "timestep"]).index
             numbers[group.index] = order.unique().sort_values().get_indexer(order)
         sequence = table["sequence"].mask(of_frames, "").astype("str")
         return Rows(table.assign(sequence=sequence, timestep=numbers))
@@ -409,16 +406,4 @@ class Rows:
 
 def _mapped(words: pd.Series[str], change: Callable[[str], str]) -> pd.Series[str]:
     """Apply ``change`` to every word, once for each distinct word."""
-    place, unique = pd.factorize(words)
-    changed = np.array([change(str(word)) for word in unique], dtype=object)[place]
-    return pd.Series(changed, words.index, dtype="str")
-
-
-def _texts(column: Any, name: str) -> pd.Series[str]:
-    """Text of every row of a dictionary column; reasons, which may be of plug-ins, shortened and without control characters."""
-    if not len(column):
-        return pd.Series([], dtype="str")
-    words = column.dictionary.to_pylist()
-    if name == "reason":
-        words = [shortened(word, MAX_REASON) for word in words]
-    return pd.Series(np.array(words, dtype=object)[column.indices.to_numpy()], dtype="str")
+    return words.map({word: change(word) for word in words.unique()}).astype("str")

@@ -11,15 +11,16 @@ from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import Literal
-
-import pandas as pd
+from typing import TYPE_CHECKING, Literal
 
 from ..bench.engine.config import CODED
 from ..bench.errors import InputError
 from ..bench.manifest import Manifest, MethodRecord
 from ..bench.rows import ALL, FRAME, FULL, LEFT_OUT, SUSPECT, Row, Rows
 from ..bench.specs import ACTING, DYNAMIC, OFF, MetricSpec
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 AVERAGED = "frames, then sequences, then subjects"
 
@@ -227,7 +228,7 @@ def measured_on(by_method: Mapping[str, Conditions], trivial: Sequence[str], mac
     return "; ".join(texts)
 
 
-STORAGE, QUALITY = "storage", "psnr"
+STORAGE, QUALITY, SPEED, LATENCY = "storage", "psnr", "fps", "latency_p50"
 TASKS = ("novel_view", "self_reenactment")
 NO_FRAMES = "The run has frames of neither task."
 STORAGE_CODED = MetricSpec(
@@ -341,3 +342,18 @@ def _mean_or_reason(
     if len(missing):
         return math.nan, str(missing.iloc[0]["reason"])
     return next(iter(subject_means(values).values())), ""
+
+
+def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
+    """Indices of the points on the Pareto front, by increasing cost.
+
+    One point dominates another if it costs no more and is no worse, and is strictly better in one of the two. Equal
+    points do not dominate each other. Lower costs and higher qualities are better; all numbers are finite.
+    """
+    front: list[int] = []
+    for index in sorted(range(len(costs)), key=lambda i: (costs[i], -qualities[i])):
+        point = qualities[index], costs[index]
+        last = (qualities[front[-1]], costs[front[-1]]) if front else None
+        if last is None or point[0] > last[0] or point == last:
+            front.append(index)
+    return front

@@ -265,8 +265,6 @@ def contact_sheet(
     ``scaled_by`` (default: all), so that a trivial baseline does not darken the others. Larger errors are clipped. ``frames`` of
     a section are consecutive, ``methods`` are the columns.
     """
-    if not frames:
-        raise InputError("contact sheet", "rows", "at least one frame", "none")
     deciding = [error for f in frames for method, error in f.errors.items() if method in scaled_by]
     scale = _nice_scale(deciding or [error for frame in frames for error in frame.errors.values()])
     heads = ["Ground truth", *(head for method in methods for head in (method, "error"))]

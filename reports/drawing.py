@@ -9,25 +9,19 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import cv2
-import matplotlib
 import numpy as np
-from matplotlib import style
-from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
-from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
 from ..bench.contracts import ByteArray, FloatArray
-from ..bench.io import figures
-from ..bench.io.figures import Canvas
 from ..bench.io.files import atomic_path
 from ..bench.io.images import write_png
 from ..bench.io.provenance import COMPOSITE
+
+if TYPE_CHECKING:  # slow to import: commands import it when they draw
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999933")
 """Colour-blind-safe palette of Okabe and Ito, with an olive by Tol instead of their yellow."""
@@ -55,6 +49,12 @@ def plot_file(
 
     ``line`` is matplotlib's style of the lines in the legend, ``markers`` are the shapes that methods have in turn.
     """
+    from matplotlib import style
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    from ..bench.io.figures import Canvas
+
     with style.context(["default", {"text.parse_math": False, "font.size": 10}]):
         figure = Figure(figsize=size, dpi=dpi, layout="constrained")
         Canvas(figure)
@@ -83,6 +83,8 @@ def show_missing(axes: Axes, text: str) -> None:
 def cost_axis(axes: Axes, *, logarithmic: bool = True, whole: bool = False) -> None:
     """A horizontal axis, set after drawing. A logarithmic one has numbers at 1, 2 and 5, or evenly spaced ones if fewer than three of
     those are in view; ``whole``: whole numbers, if the range is not too narrow."""
+    from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
+
     axes.margins(0.08, 0.12)
     if logarithmic:
         axes.set_xscale("log")
@@ -147,6 +149,8 @@ class _Paper:
     images: list[tuple[int, int, ByteArray]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        from matplotlib.figure import Figure
+
         self.figure = Figure(dpi=DPI)
         self.axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
         self.axes.set_axis_off()
@@ -155,7 +159,9 @@ class _Paper:
         self, left: float, text: str, size: int, colour: str = INK, *, drop: int = 0, width: int | None = None
     ) -> None:
         """Write one line of text, its top ``drop`` below the current height, truncated to about ``width``."""
-        text = figures.drawable(text)
+        from ..bench.io.figures import drawable
+
+        text = drawable(text)
         limit = len(text) if width is None else _characters(width, size)
         text = text if len(text) <= limit else text[: limit - 1] + "…"
         points = size * 72 / DPI
@@ -163,7 +169,7 @@ class _Paper:
 
     def fill(self, left: int, width: int, height: int, colour: str, *, drop: int = 0) -> None:
         """Fill a rectangle."""
-        rgb = np.rint(255 * np.array(to_rgb(colour))).astype(np.uint8)
+        rgb = np.array([*bytes.fromhex(colour.removeprefix("#"))], np.uint8)
         self.images.append((left, self.y + drop, np.tile(rgb, (height, width, 1))))
 
     def framed(self, left: int, image: ByteArray, colour: str, line: int) -> None:
@@ -175,6 +181,8 @@ class _Paper:
     def tile(self, left: int, tile: Tile, width: int, height: int) -> None:
         """Draw an image, or a grey box with as much of its reason as fits."""
         if isinstance(tile.picture, str):
+            from matplotlib.patches import Rectangle
+
             self.axes.add_patch(Rectangle((left, self.y), width, height, color=BOX, linewidth=0))
             fit, lines = _characters(width - 16, SMALL), max(1, (height - 8) // (SMALL + 4))
             words = textwrap.wrap(tile.picture, fit, max_lines=lines, placeholder=" …")
@@ -188,6 +196,8 @@ class _Paper:
 
     def save(self, path: Path) -> None:
         """Write the page down to the current height as a PNG, atomically."""
+        from ..bench.io import figures
+
         scale = min(1.0, figures.LONGEST / max(self.width, self.y))
         self.figure.set_size_inches(self.width / DPI, self.y / DPI)
         self.axes.set(xlim=(0, self.width), ylim=(self.y, 0))
@@ -201,7 +211,6 @@ class _Paper:
         write_png(path, np.ascontiguousarray(page), COMPOSITE)
 
 
-@style.context("default")  # independent of the user's matplotlibrc, such as text.usetex
 def write_sheet(
     path: Path,
     sections: Sequence[SheetSection],
@@ -219,48 +228,53 @@ def write_sheet(
     of error maps and the text after it, for a colour bar. ``pairs``: smaller gaps between columns 1 and 2, 3 and 4, ...;
     ``label_width``: of the row labels on the left, pixels.
     """
-    tiles = [tile for section in sections for row in section.rows for tile in row.tiles]
-    width = max((t.picture.shape[1] for t in tiles if not isinstance(t.picture, str)), default=label_width)
+    from matplotlib import style
 
-    def left(column: int) -> int:
-        return MARGIN + label_width + column * (width + GAP) + (GAP * ((column + 1) // 2) if pairs else 0)
+    with style.context("default"):  # independent of the user's matplotlibrc, such as text.usetex
+        tiles = [tile for section in sections for row in section.rows for tile in row.tiles]
+        width = max(
+            (t.picture.shape[1] for t in tiles if not isinstance(t.picture, str)), default=label_width
+        )
 
-    columns = max(len(row.tiles) for section in sections for row in section.rows)
-    paper = _Paper(max(left(columns) + MARGIN - GAP, SMALLEST_WIDTH))
-    paper.text(MARGIN, title, TITLE)
-    paper.y += TITLE + 10
-    for line in textwrap.wrap(subtitle, _characters(paper.width - 2 * MARGIN, SMALL)):
-        paper.text(MARGIN, line, SMALL, MUTED)
-        paper.y += SMALL + 5
-    paper.y += 8
-    for index, (colour, meaning) in enumerate((marks or {}).items()):
-        paper.framed(MARGIN + 260 * index, WHITE, colour, MARKED)
-        paper.text(MARGIN + 260 * index + 28, meaning, SMALL, MUTED)
-    paper.y += SMALL + 10 if marks else 0
-    if error_scale is not None:
-        _colour_bar(paper, *error_scale)
+        def left(column: int) -> int:
+            return MARGIN + label_width + column * (width + GAP) + (GAP * ((column + 1) // 2) if pairs else 0)
 
-    for section in sections:
-        paper.y += 10
-        paper.text(MARGIN, section.title, TEXT)
-        paper.y += TEXT + 8
-        paper.fill(MARGIN, paper.width - 2 * MARGIN, 1, LINE)
+        columns = max(len(row.tiles) for section in sections for row in section.rows)
+        paper = _Paper(max(left(columns) + MARGIN - GAP, SMALLEST_WIDTH))
+        paper.text(MARGIN, title, TITLE)
+        paper.y += TITLE + 10
+        for line in textwrap.wrap(subtitle, _characters(paper.width - 2 * MARGIN, SMALL)):
+            paper.text(MARGIN, line, SMALL, MUTED)
+            paper.y += SMALL + 5
         paper.y += 8
-        for column, head in enumerate(section.heads):
-            paper.text(left(column), head, SMALL, width=width)
-        paper.y += SMALL + 8
-        for row in section.rows:
-            sizes = [t.picture.shape[:2] for t in row.tiles if not isinstance(t.picture, str)]
-            height = max((h for h, _ in sizes), default=width)
-            for index, label in enumerate(row.labels):
-                colour, drop = MUTED if index else INK, index * (SMALL + 6)
-                paper.text(MARGIN, label, SMALL, colour, drop=drop, width=label_width - 8)
-            for column, tile in enumerate(row.tiles):
-                paper.tile(left(column), tile, width, height)
-            caption = SMALL + 7 if any(tile.caption for tile in row.tiles) else 0
-            paper.y += max(height + caption, len(row.labels) * (SMALL + 6)) + GAP
-    paper.y += MARGIN - GAP
-    paper.save(path)
+        for index, (colour, meaning) in enumerate((marks or {}).items()):
+            paper.framed(MARGIN + 260 * index, WHITE, colour, MARKED)
+            paper.text(MARGIN + 260 * index + 28, meaning, SMALL, MUTED)
+        paper.y += SMALL + 10 if marks else 0
+        if error_scale is not None:
+            _colour_bar(paper, *error_scale)
+
+        for section in sections:
+            paper.y += 10
+            paper.text(MARGIN, section.title, TEXT)
+            paper.y += TEXT + 8
+            paper.fill(MARGIN, paper.width - 2 * MARGIN, 1, LINE)
+            paper.y += 8
+            for column, head in enumerate(section.heads):
+                paper.text(left(column), head, SMALL, width=width)
+            paper.y += SMALL + 8
+            for row in section.rows:
+                sizes = [t.picture.shape[:2] for t in row.tiles if not isinstance(t.picture, str)]
+                height = max((h for h, _ in sizes), default=width)
+                for index, label in enumerate(row.labels):
+                    colour, drop = MUTED if index else INK, index * (SMALL + 6)
+                    paper.text(MARGIN, label, SMALL, colour, drop=drop, width=label_width - 8)
+                for column, tile in enumerate(row.tiles):
+                    paper.tile(left(column), tile, width, height)
+                caption = SMALL + 7 if any(tile.caption for tile in row.tiles) else 0
+                paper.y += max(height + caption, len(row.labels) * (SMALL + 6)) + GAP
+        paper.y += MARGIN - GAP
+        paper.save(path)
 
 
 def _colour_bar(paper: _Paper, top: int, more: str) -> None:
@@ -282,4 +296,6 @@ def _characters(width: int, size: int) -> int:
 
 def colour_map(values: FloatArray) -> ByteArray:
     """Map (H, W) values in [0, 1], clamped, to (H, W, 3) colours of the perceptually uniform map "magma"."""
-    return matplotlib.colormaps["magma"](np.clip(values, 0.0, 1.0), bytes=True)[..., :3]
+    from matplotlib import colormaps
+
+    return colormaps["magma"](np.clip(values, 0.0, 1.0), bytes=True)[..., :3]

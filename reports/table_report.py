@@ -7,9 +7,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, cast
 
-import pandas as pd
 import tyro
 
 from ..bench.contracts import Progress
@@ -22,6 +21,9 @@ from ..bench.specs import CommandResult, MetricSpec, command
 from .runs import SPLIT_TASK, WHOLE, FrameSelection, RunSet
 from .tables import AVATAR_TITLE, COMPARISON, TITLES, Table, build_table
 from .writers import WRITERS, to_text
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Format: TypeAlias = Literal["text", "md", "csv", "latex", "html", "json"]
 
@@ -100,6 +102,8 @@ class ComparedRuns(RunSet):
 
         Values are means over frames, then sequences, subjects and seeds; NaN if one is missing.
         """
+        import pandas as pd
+
         metrics = [spec for spec in self.metrics if COMPARISON in spec.tables]
         runs = self.by_camera
         table = build_table(runs.without_conditions, metrics, runs.tasks)

@@ -233,9 +233,6 @@ def _templates() -> Environment:
     return Environment(autoescape=True, keep_trailing_newline=True, loader=FileSystemLoader(folders))
 
 
-FORMULA_STARTS = ("=", "+", "-", "@")
-
-
 def to_csv(table: Table) -> str:
     """Write one line per method, in full precision.
 
@@ -262,27 +259,10 @@ def to_csv(table: Table) -> str:
 
 
 def csv_text(lines: Iterable[Sequence[object]]) -> str:
-    """Write lines as CSV, None as an empty cell.
-
-    Text that a spreadsheet would interpret as a formula is prefixed by an apostrophe, as OWASP recommends ("CSV Injection").
-    """
+    """Write lines as CSV, None as an empty cell."""
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerows([_without_formula(value) for value in line] for line in lines)
+    csv.writer(stream, lineterminator="\n").writerows(lines)
     return stream.getvalue()
-
-
-def _without_formula(value: object) -> object:
-    if not isinstance(value, str):
-        return value
-    value = value.replace("\r", " ")  # not quoted by the writer, and read as the end of a line
-    if not value.lstrip().startswith(FORMULA_STARTS):
-        return value
-    try:
-        float(value)
-    except ValueError:
-        return f"'{value}"
-    return value
 
 
 def to_json(table: Table) -> str:

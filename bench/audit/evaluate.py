@@ -35,8 +35,6 @@ from ..engine.run import run
 from ..engine.store import Cell
 from ..engine.stored import avatar_digest, open_avatar
 from ..errors import HeadbenchError, InputError
-from ..executors.schedule import run_as_task
-from ..executors.settings import ExecutionOptions
 from ..io.files import (
     atomic_path,
     check_name,
@@ -53,7 +51,7 @@ from .frames import Render, check_truth, composited, named_renders
 
 
 @dataclass(frozen=True)
-class EvaluateSettings(ExecutionOptions):
+class EvaluateSettings:
     """Score a folder of images, made without a plug-in, or a stored avatar.
 
     An image is SEQUENCE_TIMESTEP_CAMERA.png (timestep of five digits), as `headbench run` names its renders: 8-bit RGB PNG of
@@ -227,10 +225,6 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
 
     The text is the table, together with the run named by ``like``.
     """
-    if settings.execution.executor in ("processes", "slurm"):
-        out = Path(settings.out)
-        place = out.with_name(f"{out.name}-task")
-        return run_as_task(f"{__name__}:evaluate_folder", settings, place, settings.device)
     source = Path(settings.folder)
     stored = open_avatar(source, settings.method) if settings.avatar else None
     label = settings.label or ("images" if stored is None else stored.record["method"])

@@ -6,10 +6,9 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import tyro
 
 from ..condition import Condition, Named
@@ -27,6 +26,9 @@ from ..protocol import make_protocols
 from ..rows import ALL, FRAME, Rows
 from ..specs import CommandResult, MetricSpec, command
 from .evaluate import NoAvatar, images_method
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -206,6 +208,8 @@ def _compare(
 
     Values may differ by a tenth of the last displayed digit, since networks round differently on other machines.
     """
+    import pandas as pd
+
     digits = {metric.name: metric.digits for metric in metrics}
     rows = rows[rows["metric"].isin(digits.keys())]
     if rows.duplicated(KEY).any():

@@ -13,11 +13,12 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 import tyro
 
+from ..comparison import DemoConfig
 from ..configuration import build_arguments, parse_assignments
 from ..contracts import Camera, Clip, FrameKey, HeadAsset, HeadPose, Progress, TaskName, no_progress
 from ..engine.adaptation import MethodNeeds, apply, plan
 from ..engine.captures import HARNESS, found_captures
-from ..engine.config import DemoConfig, ResolvedMethod, RunConfig, resolve_method
+from ..engine.config import ResolvedMethod, RunConfig, resolve_method
 from ..errors import InputError
 from ..io.files import check_name, to_jsonable
 from ..machine import check_device

@@ -9,8 +9,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from difflib import get_close_matches
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -18,7 +17,7 @@ from ..condition import PLAIN, Condition, Named, label_of
 from ..configuration import build, build_arguments, deciding_settings, merge, setting_paths
 from ..contracts import Budget, TaskName
 from ..errors import InputError
-from ..io.files import check_name, check_utf8
+from ..io.files import check_name
 from ..registry import code_digest, discover, forget_code, get, is_outside, resolve, unknown
 from ..specs import ConditionSpec, MethodSpec, MetricSpec, ProfileSpec
 
@@ -133,9 +132,7 @@ def build_run_config(values: Mapping[str, Any], source: str) -> RunConfig:
                 raise InputError(
                     source, key, "a setting of a run", repr(key), f"Did you mean {places[near[0]]}?"
                 )
-    config = build(RunConfig, values, source)
-    check_utf8(config.data, source, "data", "a path")
-    return config
+    return build(RunConfig, values, source)
 
 
 def _setting_places() -> dict[str, str]:
@@ -378,74 +375,6 @@ class RunOptions:
     trust: bool = False
     """Import the modules that the run folder names for methods, metrics and readers which are not registered; they can
     run any code."""
-
-
-QUICK: Final = "quick"
-"""Preset of the demo: about 3 minutes on two cores, with fewer scored frames, without coded avatars and speeds."""
-QUICK_FRAMES = 23
-"""Number of scored frames of a task: a prime, so that evenly spaced ones are of all 8 cameras."""
-DEMO_SIZES: Mapping[str, Mapping[str, Any]] = {
-    "smoke": {"cameras": 3, "timesteps": 8, "size": "48x64"},
-    QUICK: {"cameras": 8, "timesteps": 16, "size": "120x174"},
-    "demo": {"cameras": 12, "timesteps": 28, "size": "144x208"},
-}
-"""Sizes of the demo's capture by preset; other presets have those of "demo"."""
-
-
-@dataclass(frozen=True)
-class DemoConfig:
-    """Settings of ``headbench demo``. Sizes that are None are those of the preset, see `DEMO_SIZES`."""
-
-    out: str = "demo-output"
-    preset: str = QUICK
-    seed: int = 0  # of the training
-    subject_seed: int = 14  # of the capture: determines the subject and the performance
-    cameras: int | None = None
-    timesteps: int | None = None
-    size: str | None = None
-    head: str = "procedural"
-    tracking_noise: float = 0.0
-
-    def capture_arguments(self) -> dict[str, Any]:
-        """Arguments of the synthesiser."""
-        sizes = dict(DEMO_SIZES.get(self.preset, DEMO_SIZES["demo"]))
-        sizes |= {name: value for name in sizes if (value := getattr(self, name)) is not None}
-        return {
-            "out": self.capture_folder,
-            "subjects": 1,
-            **sizes,
-            "size": parse_size(sizes["size"]),
-            "head": self.head,
-            "seed": self.subject_seed,
-            "tracking_noise": self.tracking_noise,
-            "performance": "full",  # which shows most in few timesteps
-        }
-
-    @property
-    def capture_folder(self) -> Path:
-        return Path(self.out) / "capture"
-
-
-def demo_run_config(config: DemoConfig, device: str) -> dict[str, Any]:
-    """`RunConfig` fields of the comparison, with the methods that have the preset and support ``device``."""
-    is_quick = config.preset == QUICK
-    specs = {name: plugin.spec for name, plugin in discover("methods").items() if plugin.spec}
-    methods = tuple(
-        name
-        for name, spec in specs.items()
-        if spec.demo and spec.computes_on(device) and (not spec.presets or config.preset in spec.presets)
-    )
-    return {
-        "data": str(config.capture_folder),
-        "out": config.out,
-        "methods": methods,
-        "preset": config.preset,
-        "seeds": (config.seed,),
-        "frames_per_task": QUICK_FRAMES if is_quick else None,
-        "metrics": tuple(
-            name for name in default_names("metrics") if not (is_quick and get("metrics", name).is_speed)
-        ),
-    }
 
 
 CODED = "coded"

@@ -9,15 +9,13 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from ..condition import PLAIN, Condition, label_of
 from ..contracts import Avatar, CheckedMethod, Clip, FrameKey, Progress
 from ..errors import InputError
 from ..io.documents import read_json
-from ..io.files import atomic_path, digest, output_inside, refuse_links
+from ..io.files import atomic_path, digest
 from ..machine import machine_record
 from ..manifest import (
     AdaptedRecord,
@@ -39,6 +37,9 @@ from .config import ResolvedMethod, RunConfig, RunOptions, resolve_cells, resolv
 from .scoring import TrainingView, check_regions
 from .store import Cell, CellRecord, RunFolder
 from .stored import AVATAR_FILE
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 RESULT_FORMAT = 1  # raise when the output of a stage changes
 TRAINING, RENDERING, MEASURING_AVATAR = "training", "rendering", "measuring the avatar"
@@ -137,11 +138,10 @@ class Job:
         return {metric.name for metric in metrics} <= {*self.cell.record.get("measured", ())}
 
     def check(self) -> None:
-        """Refuse a folder with an avatar from other inputs or other code, or with links that point outside of it.
+        """Refuse a folder with an avatar from other inputs or other code.
 
         The method also checks that it can train and render, unless that is done.
         """
-        refuse_links(self.cell.folder)
         if self.source is not None and not self.follows:
             source_fingerprint(self)
         record = self.cell.record
@@ -414,25 +414,22 @@ def _adapted(
                 key = f"{error.key} of {method.spec.name}"
                 raise InputError(error.file, key, error.expected, error.found, error.remedy) from error
     forms: dict[tuple[str, MethodNeeds], AdaptedClip | None] = dict.fromkeys(planned)
-    with output_inside(out.root):
-        for subject in {clip.subject for clip, step in planned.values() if step is not None}:
-            for folder in stored:
-                if folder != out.adapted:
-                    _copy_missing(folder / subject, out.adapted / subject)
-        for (fingerprint, needs), (clip, step) in planned.items():
-            if step is not None:
-                folder, label = out.adapted / clip.subject, f"adapting {clip.subject}"
-                forms[fingerprint, needs] = adaptation.apply(step, needs, folder, label)
+    for subject in {clip.subject for clip, step in planned.values() if step is not None}:
+        for folder in stored:
+            if folder != out.adapted:
+                _copy_missing(folder / subject, out.adapted / subject)
+    for (fingerprint, needs), (clip, step) in planned.items():
+        if step is not None:
+            folder, label = out.adapted / clip.subject, f"adapting {clip.subject}"
+            forms[fingerprint, needs] = adaptation.apply(step, needs, folder, label)
     return forms
 
 
 def _copy_missing(source: Path, folder: Path) -> None:
-    """Copy the files missing from ``folder``; links are not followed, since the run may be untrusted."""
-    if source.is_symlink() or source.parent.is_symlink():
-        return
+    """Copy the files missing from ``folder``."""
     for path in sorted(source.rglob("*")):
         target = folder / path.relative_to(source)
-        if path.is_file() and not path.is_symlink() and not target.exists():
+        if path.is_file() and not target.exists():
             with atomic_path(target) as temporary:
                 shutil.copyfile(path, temporary)
 

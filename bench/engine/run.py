@@ -14,17 +14,15 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..condition import Condition, label_of
 from ..contracts import Clip
 from ..errors import HeadbenchError, InputError, LeftOutError, UnavailableError, reason_of, shortened
-from ..executors.schedule import DAMAGED, Schedule
 from ..executors.settings import Execution, check_executor
-from ..executors.task import FULL_DISK, Task, read_outcome
-from ..io.files import check_kind, check_output_folder
+from ..io.files import FULL_DISK, check_kind, check_output_folder
 from ..io.lock import locked
 from ..machine import (
     check_device,
@@ -43,7 +41,10 @@ from .cell import failed_rows, kept_rows, run_cell
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
 from .plan import Job, Plan, make_jobs, make_plan
 from .scoring import compared_over_time, make_metric
-from .store import FinishedRun, RunFolder
+from .store import FinishedRun, RunFolder, read_outcome
+
+if TYPE_CHECKING:
+    from ..executors.task import Task
 
 WORKER_BYTES = 2_000_000_000
 """Memory that a worker may need, for the executor ``auto``."""
@@ -256,6 +257,9 @@ def execute(plan: Plan, execution: Execution) -> list[Rows]:
     Measured cells are kept. A cell whose process or job was lost is restarted, at most `Execution.restarts`
     times. A cell that fails has failed rows.
     """
+    from ..executors.schedule import Schedule  # a run in this process needs no executor
+    from ..executors.task import DAMAGED
+
     jobs, metrics = plan.jobs, plan.metrics
     captures = {subject: index for index, subject in enumerate(dict.fromkeys(j.clip.subject for j in jobs))}
     tasks = [_task(job, captures[job.clip.subject], plan.folder) for job in jobs]
@@ -277,13 +281,12 @@ def execute(plan: Plan, execution: Execution) -> list[Rows]:
         )
         left = [task for task in tasks if task.place not in failures and not speed.is_done(task)]
         failures |= speed.run_all([replace(task, speed=True) for task in left])
-    return [_merged(job, metrics, failures.get(place)) for place, job in places.items()]
-
-
-def _merged(job: Job, metrics: Sequence[MetricSpec], failure: str | None) -> Rows:
-    """Rows of a cell that has ended."""
-    rows = kept_rows(job, metrics) if failure is None else None
-    return failed_rows(job, metrics, failure or f"HeadbenchError: {DAMAGED}") if rows is None else rows
+    parts = []
+    for place, job in places.items():
+        rows = None if place in failures else kept_rows(job, metrics)
+        reason = failures.get(place, f"HeadbenchError: {DAMAGED}")
+        parts.append(failed_rows(job, metrics, reason) if rows is None else rows)
+    return parts
 
 
 def _machine_of(jobs: Sequence[Job], otherwise: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -311,6 +314,8 @@ def _all_of(names: Iterable[str]) -> str:
 
 def _task(job: Job, capture: int, folder: RunFolder) -> Task:
     """The task of a cell of the run in ``folder``; ``capture`` is the index of its subject among the captures found."""
+    from ..executors.task import Task
+
     place = job.cell.folder.relative_to(folder.root).as_posix()
     cell = {"subject": job.clip.subject, "label": job.label, "seed": job.seed, "capture": capture}
     task = Task.of(folder.root, place, f"{__name__}:execute_cell", **cell)

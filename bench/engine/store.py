@@ -22,16 +22,39 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Required
 
 from typing_extensions import TypedDict
 
 from ..contracts import Clip, FrameKey
 from ..errors import InputError
-from ..executors.task import TaskOutcome, read_record, record_path, update_record
-from ..io.documents import checked
+from ..io.documents import checked, read_json
+from ..io.files import write_json
 from ..manifest import Manifest
 from ..rows import Rows
+
+
+class TaskOutcome(TypedDict, total=False):
+    """Entry ``task`` of ``cell.json``: current activity of a task's process or job, or how it ended."""
+
+    status: Required[Literal["running", "done", "failed"]]
+    """A job that no longer exists while it is "running" was killed."""
+    speed: Required[bool]
+    """Whether speed is measured, in a separate pass over a run's cells."""
+    reason: str
+    """Reason of the failure, as in the rows of a cell."""
+    doing: str  # current step
+    since: str  # ISO 8601, UTC
+    seconds: float
+    restarts: int
+    job: str
+    """Job of the cluster, "" for a process of ``host``."""
+    process: int
+    host: str
+    threads: str
+    """Value of OMP_NUM_THREADS, "" for the number of cores."""
+    machine: dict[str, Any]
+    """See `machine_record`."""
 
 
 class CellRecord(TypedDict, total=False):
@@ -55,6 +78,29 @@ class CellRecord(TypedDict, total=False):
     """Codec of the measured avatar, see `CodedAvatar`."""
     task: TaskOutcome
     """Of the process or job of the cell."""
+
+
+def record_path(folder: Path) -> Path:
+    """The record of a cell, or of another task, in its folder."""
+    return folder / "cell.json"
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Read the record of a folder; empty if it is missing."""
+    path = record_path(folder)
+    return read_json(path) if path.exists() else {}
+
+
+def update_record(folder: Path, **changes: Any) -> None:
+    """Write entries of the record atomically; None removes one."""
+    record = {**read_record(folder), **changes}
+    write_json(record_path(folder), {key: value for key, value in record.items() if value is not None})
+
+
+def read_outcome(folder: Path) -> TaskOutcome | None:
+    """Read the outcome of a task's folder; None if it is missing."""
+    outcome = read_record(folder).get("task")
+    return None if outcome is None else checked(outcome, TaskOutcome, record_path(folder), "task")
 
 
 @dataclass(frozen=True)

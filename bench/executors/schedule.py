@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
-import shutil
 import signal
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -14,39 +13,18 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from ..configuration import build
-from ..errors import HeadbenchError
-from ..io.documents import checked, read_json
-from ..io.files import write_json
-from ..io.lock import locked
-from ..machine import processor_count
-from ..process import environment_variable
+from ..engine.store import TaskOutcome, read_outcome, update_record
+from ..machine import environment_variable, processor_count
 from ..progress import TasksLeft, progress
-from ..registry import resolve
-from ..specs import CommandResult
 from ..start import end_with_parent, starting_workers
-from .settings import Execution, ExecutionOptions, check_executor
+from .settings import Execution
 from .slurm import Slurm
-from .task import (
-    TASK_LOG,
-    Executor,
-    Task,
-    TaskOutcome,
-    TaskResult,
-    execute_task,
-    forget_outcome,
-    read_outcome,
-    update_record,
-)
+from .task import DAMAGED, TASK_LOG, Executor, Task, TaskResult, execute_task, forget_outcome
 
 POLL_S = 1.0
 """Seconds between updates of the progress."""
-RESULT = "result.json"
-PLACE = "command"
 log = logging.getLogger(__name__)
-DAMAGED = "its results are missing or damaged"
 Failures = dict[str, str]
 """Reasons of failed tasks, by their folder."""
 
@@ -239,44 +217,3 @@ def _activities(tasks: Sequence[Task]) -> dict[str, str]:
         outcome = read_outcome(task.folder)
         steps[task.name or task.place] = "starting" if outcome is None else outcome.get("doing", "starting")
     return steps
-
-
-def run_as_task(function: str, settings: ExecutionOptions, folder: Path, device: str) -> CommandResult:
-    """Run ``function`` ("module:name" of a command) with its settings by their executor; return its result.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder for the log and the result, which is removed at the end.
-    """
-    execution = settings.execution
-    check_executor(execution, device)
-    kind = f"{type(settings).__module__}:{type(settings).__name__}"
-    folder = folder.resolve()
-    folder.mkdir(parents=True, exist_ok=True)
-    task = Task.of(
-        folder, PLACE, f"{__name__}:execute_command", command=function, kind=kind, settings=settings.others
-    )
-    result = folder / PLACE / RESULT
-    result.unlink(missing_ok=True)
-    with locked(folder):
-        failed = Schedule("command", lambda task: result.is_file(), execution).run_all(
-            [replace(task, device=device)]
-        )
-    for reason in failed.values():
-        raise HeadbenchError(f"{reason} Its log is {folder / PLACE / TASK_LOG}.")
-    values = checked(read_json(result), dict[str, Any], result)
-    shutil.rmtree(folder)
-    return CommandResult(**values)
-
-
-def execute_command(task: Task, report: Callable[[str], None]) -> None:
-    """Run the command of a task in this process and write its result."""
-    given = task.arguments
-    settings = build(resolve(given["kind"]), given["settings"], "settings of the task")
-
-    def progress(done: int, total: int, note: str = "") -> None:
-        report(f"{done} of {total} {note}")
-
-    result = resolve(given["command"])(settings, progress)
-    write_json(task.folder / RESULT, result._asdict())

@@ -12,9 +12,8 @@ import tyro
 
 from ..configuration import build, merge, parse_assignments
 from ..errors import UnavailableError, install_extra
-from ..machine import check_device
+from ..machine import check_device, environment_variable
 from ..options import DependentOptions, check_dependent
-from ..process import environment_variable
 from ..registry import unknown
 
 ExecutorName = Literal["auto", "inline", "processes", "slurm"]
@@ -133,7 +132,9 @@ def chosen_execution(
     options = {"executor": executor, "workers": workers}
     options = {key: value for key, value in options.items() if value is not None}
     # `build` refuses other values.
-    values = merge(merge({"executor": "auto"}, settings), options) if isinstance(settings, Mapping) else settings
+    values = (
+        merge(merge({"executor": "auto"}, settings), options) if isinstance(settings, Mapping) else settings
+    )
     execution = build(Execution, values, source, "execution.")
     given = {key: f"--set execution.{key}" for key in assigned} | {key: f"--{key}" for key in options}
     check_dependent(DEPENDENT, execution, given)

@@ -18,11 +18,12 @@ from typing import Any, NamedTuple
 
 from typing_extensions import TypedDict
 
+from ..engine.store import read_outcome
 from ..errors import HeadbenchError, InputError, UnavailableError
 from ..io.documents import checked, read_json
-from ..io.files import check_room, digest, write_json
+from ..io.files import FULL_DISK, check_room, digest, write_json
 from .settings import Execution, import_submitit
-from .task import FULL_DISK, Task, TaskResult, execute_task, forget_outcome, read_outcome
+from .task import Task, TaskResult, execute_task, forget_outcome
 
 log = logging.getLogger(__name__)
 MAX_ARRAY = 1000

@@ -15,7 +15,7 @@ from typing import Literal
 import tyro
 
 from ..contracts import Progress, no_progress
-from ..engine.store import RunFolder
+from ..engine.store import RunFolder, TaskOutcome, read_outcome
 from ..errors import HeadbenchError
 from ..io.lock import is_locked
 from ..manifest import Manifest
@@ -23,7 +23,7 @@ from ..progress import counted, duration
 from ..rows import ALL
 from ..specs import CommandResult, command
 from .slurm import Queued, queue, read_submitted
-from .task import TASK_LOG, TaskOutcome, read_outcome
+from .task import TASK_LOG
 
 log = logging.getLogger(__name__)
 State = Literal["waiting", "running", "done", "failed"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import os
 import platform
@@ -14,13 +13,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol, Required
+from typing import Any, NamedTuple, Protocol
 
-from typing_extensions import TypedDict
-
+from ..engine.store import TaskOutcome, read_outcome, update_record
 from ..errors import reason_of
-from ..io.documents import checked, read_json
-from ..io.files import no_link, output_inside, write_json
+from ..io.files import FULL_DISK
 from ..io.lock import locked
 from ..machine import check_device, machine_record
 from ..progress import log_to_file
@@ -28,8 +25,7 @@ from ..registry import resolve
 
 log = logging.getLogger(__name__)
 TASK_LOG = "job.log"
-FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-"""System errors that would affect every other task."""
+DAMAGED = "its results are missing or damaged"
 
 
 @dataclass(frozen=True)
@@ -65,52 +61,6 @@ class Task:
     def folder(self) -> Path:
         """Folder of its outcome and log."""
         return Path(self.root) / self.place
-
-
-class TaskOutcome(TypedDict, total=False):
-    """Entry ``task`` of ``cell.json``: current activity of a task's process or job, or how it ended."""
-
-    status: Required[Literal["running", "done", "failed"]]
-    """A job that no longer exists while it is "running" was killed."""
-    speed: Required[bool]
-    """Whether speed is measured, in a separate pass over a run's cells."""
-    reason: str
-    """Reason of the failure, as in the rows of a cell."""
-    doing: str  # current step
-    since: str  # ISO 8601, UTC
-    seconds: float
-    restarts: int
-    job: str
-    """Job of the cluster, "" for a process of ``host``."""
-    process: int
-    host: str
-    threads: str
-    """Value of OMP_NUM_THREADS, "" for the number of cores."""
-    machine: dict[str, Any]
-    """See `machine_record`."""
-
-
-def record_path(folder: Path) -> Path:
-    """The record of a cell, or of another task, in its folder."""
-    return folder / "cell.json"
-
-
-def read_record(folder: Path) -> dict[str, Any]:
-    """Read the record of a folder; empty if it is missing."""
-    path = record_path(folder)
-    return read_json(path) if path.exists() else {}
-
-
-def update_record(folder: Path, **changes: Any) -> None:
-    """Write entries of the record atomically; None removes one."""
-    record = {**read_record(folder), **changes}
-    write_json(record_path(folder), {key: value for key, value in record.items() if value is not None})
-
-
-def read_outcome(folder: Path) -> TaskOutcome | None:
-    """Read the outcome of a task's folder; None if it is missing."""
-    outcome = read_record(folder).get("task")
-    return None if outcome is None else checked(outcome, TaskOutcome, record_path(folder), "task")
 
 
 def forget_outcome(folder: Path, speed: bool) -> None:
@@ -165,7 +115,7 @@ def execute_task(task: Task) -> None:
         "host": platform.node(),
         "threads": os.environ.get("OMP_NUM_THREADS", ""),
     }
-    with output_inside(Path(task.root)), locked(folder), _output_to(folder), log_to_file(folder / TASK_LOG):
+    with locked(folder), _output_to(folder), log_to_file(folder / TASK_LOG):
         before = 0.0
         first = read_outcome(folder) if task.speed else None
         if first is not None and not first["speed"]:
@@ -203,7 +153,7 @@ def _output_to(folder: Path) -> Iterator[None]:
     sys.stdout.flush()
     sys.stderr.flush()
     before = [os.dup(number) for number in (1, 2)]
-    with open(folder / TASK_LOG, "a", encoding="utf-8", opener=no_link) as stream:
+    with open(folder / TASK_LOG, "a", encoding="utf-8") as stream:
         for number in (1, 2):
             os.dup2(stream.fileno(), number)
     try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -22,7 +21,7 @@ from ..engine.scoring import TrainingView
 from ..engine.store import Cell, RunFolder
 from ..errors import InputError
 from ..executors.settings import ExecutionOptions
-from ..io.files import check_kind, check_name, output_inside, refuse_links
+from ..io.files import check_kind, check_name
 from ..io.lock import locked
 from ..options import DependentOptions
 from ..registry import get, resolve
@@ -76,7 +75,7 @@ def sweep_run(settings: SweepSettings, progress: Progress = no_progress) -> Comm
     source.read_manifest()  # before a folder is created
     out = Path(settings.out) if settings.out else source.root / "sweep"
     check_kind(out, "a run")
-    with nullcontext() if settings.out else output_inside(source.root), locked(out):
+    with locked(out):
         config, jobs = trained(source.root, settings.methods, settings, out)
         able = [job for job in jobs if job.method.spec.variants]
         unable = sorted({job.method.spec.name for job in jobs} - {job.method.spec.name for job in able})
@@ -242,7 +241,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
     out = Path(settings.out) if settings.out else source.root / name
     check_kind(out, "a run")
     wanted = _wanted(settings, source)
-    with nullcontext() if settings.out else output_inside(source.root), locked(out):
+    with locked(out):
         config, opened = open_run_clips(source.root, settings, out=out)
         held = Named("hold-out", {"camera": settings.camera, "every": settings.every})
         config = replace(
@@ -257,7 +256,6 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
         clips: list[Clip] = [hold_out(clip, config, **held.parameters) for clip in opened]
         tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in clips))
         config = replace(config, tasks=tasks, conditions=tuple(conditions(settings, wanted, clips)))
-        refuse_links(out)
         _drop_interrupted(out)
         unchecked = bool(manifest.unchecked)  # for a run whose captures have errors
         run(config, execution, clips=clips, is_locked=True, reports=False, unchecked=unchecked)

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import cv2
 import numpy as np
 import tyro
-from scipy.special import ndtri
 
 from ..condition import Condition, Named
 from ..contracts import Avatar, Clip, DepthAvatar, FloatArray, FrameKey, HeadPose, Progress, no_progress
@@ -22,7 +19,7 @@ from ..engine.run import run
 from ..engine.store import RunFolder
 from ..errors import UnavailableError
 from ..executors.settings import ExecutionOptions, check_executor
-from ..io.files import check_kind, digest, output_inside, write_json
+from ..io.files import check_kind, digest, write_json
 from ..io.lock import locked
 from ..protocol import Protocol
 from ..registry import get, resolve
@@ -52,7 +49,7 @@ from .truth import (
     TruthPictures,
     without_truth,
 )
-from .viewpoints import Viewpoint, common_target, turntable
+from .viewpoints import Viewpoint, common_target, head_center, training_poses, turntable, typical_pose
 
 
 @dataclass(frozen=True)
@@ -163,7 +160,7 @@ def _run(settings: ExtremesSettings | ReenactSettings, drive: str, task: str) ->
     source.read_manifest()  # before a folder is created
     out = Path(settings.out) if settings.out else source.root / task
     check_kind(out, "a run")
-    with nullcontext() if settings.out else output_inside(source.root), locked(out):
+    with locked(out):
         config, jobs = trained(source.root, settings.methods, settings, out)
         check_executor(execution, config.device)
         config = replace(
@@ -262,20 +259,11 @@ def joint_samples(count: int, dimensions: int, sigmas: float) -> FloatArray:
     In each dimension, the values are the middle quantiles of ``count`` parts of equal probability, in random order
     (McKay, Beckman, Conover, Technometrics 21(2), 1979).
     """
+    from scipy.special import ndtri  # which help does without
+
     rng = np.random.default_rng(0)
     parts = np.stack([rng.permutation(count) for _ in range(dimensions)], axis=1)
     return np.asarray(np.clip(ndtri((parts + 0.5) / count), -sigmas, sigmas))
-
-
-def training_poses(clip: Clip) -> list[HeadPose]:
-    """Tracked poses of the training timesteps, in order."""
-    return [clip.poses[t] for t in sorted({key.timestep for key in clip.splits["train"]})]
-
-
-def typical_pose(poses: Sequence[HeadPose]) -> HeadPose:
-    """The recorded pose whose expression is nearest to the mean; a real pose, so that its parts are consistent."""
-    expressions = np.array([pose.expression for pose in poses], np.float64)
-    return poses[int(np.argmin(np.linalg.norm(expressions - expressions.mean(axis=0), axis=1)))]
 
 
 TYPICAL, PATH = "typical", "path"
@@ -359,17 +347,6 @@ class ExtremesPlan:
         frames += [PlannedFrame(PATH, n, pose, front) for n, pose in enumerate(path_poses(poses, path))]
         asked = (views, beyond, dimensions, samples, sigmas, path)
         return cls(chosen, frames, digest(TASK, 2, clip.fingerprint, asked, tuple(LIMITS.values()))[:12])
-
-
-def head_center(clip: Clip) -> FloatArray:
-    """(3,) centre of the head's bounding box in its typical training pose, metres."""
-    head, pose = clip.head, typical_pose(training_poses(clip))
-    coefficients = np.asarray(clip.shape, np.float64)
-    shaped = head.template + head.shape_basis[..., : len(coefficients)] @ coefficients
-    joint = head.joint_regressor[0] @ shaped
-    rotation, _ = cv2.Rodrigues(np.asarray(pose.rotation, np.float64))
-    middle = (shaped.min(axis=0) + shaped.max(axis=0)) / 2
-    return np.asarray(rotation @ (middle - joint) + joint + pose.translation)
 
 
 def protocols(jobs: Sequence[Job], **parameters: Any) -> dict[str, Protocol]:

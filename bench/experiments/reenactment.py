@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from skimage.color import deltaE_ciede2000
 
 from ..condition import PLAIN
 from ..contracts import (
@@ -34,7 +33,6 @@ from ..io.files import digest
 from ..io.images import quantise, write_png
 from ..protocol import Protocol, evenly
 from ..rows import Row, Rows
-from .extremes import training_poses
 from .stability import (
     JudgedFrame,
     LimitCheck,
@@ -47,6 +45,7 @@ from .stability import (
     typical,
     write_frame,
 )
+from .viewpoints import training_poses
 
 STEADY_M = 0.0005
 """Vertices that training expressions (one standard deviation of each) move by less than this count as static."""
@@ -123,6 +122,8 @@ class RecordedAppearance:
         both = np.isfinite(self.colours).all(axis=1) & np.isfinite(colours).all(axis=1)
         if both.sum() < LEAST_VERTICES:
             return None
+        from skimage.color import deltaE_ciede2000
+
         return float(deltaE_ciede2000(self.colours[both], colours[both]).mean())
 
 

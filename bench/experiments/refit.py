@@ -13,7 +13,8 @@ import numpy as np
 
 from ..contracts import Avatar, ByteArray, Camera, Clip, FloatArray, FrameKey, HeadPose
 from ..io.images import quantise
-from .extremes import PoseComponents, head_center, training_poses
+from .extremes import PoseComponents
+from .viewpoints import head_center, training_poses
 
 UNITS = np.array([0.05] * 3 + [0.005] * 3 + [0.05] * 3)
 """Changes of rotation, translation and jaw (radians, metres, radians) of the same weight as one standard deviation of expression."""

@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Literal
 
-from ..comparison import closing
+from ..comparison import closing, presets_of_methods
 from ..condition import PLAIN, Condition, Named
 from ..contracts import Progress, no_progress
 from ..engine.config import (
@@ -24,7 +24,6 @@ from ..engine.run import run
 from ..errors import InputError
 from ..executors.settings import ExecutionOptions, check_executor
 from ..io.files import write_text
-from ..listing import presets_of_methods
 from ..registry import discover
 from ..specs import CommandResult, MethodSpec, command
 from .extremes import ExtremesSettings, extremes_run

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from skimage.color import deltaE_ciede2000
 
 from ..contracts import ByteArray, Camera, FloatArray, Frame, GroundTruth, HeadPose, TrueFrame
 from ..engine.plan import Job
@@ -210,6 +209,8 @@ class TruthJudge:
 
     def _colour(self, frame: TruthPair) -> LimitCheck:
         """CIEDE2000 difference of the face's mean colours."""
+        from skimage.color import deltaE_ciede2000  # loads SciPy, which help does without
+
         if not frame.truth.face.any():
             return _absent("colour", FULL, NO_FACE)
         means = [_lab(image)[frame.truth.face].mean(axis=0) for image in (frame.picture, frame.truth.rgb)]

@@ -1,13 +1,14 @@
-"""A turntable of views between the training cameras and beyond them."""
+"""Views of a head between its training cameras and beyond them, and its typical pose, which they face."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from ..contracts import Camera, FloatArray
+from ..contracts import Camera, Clip, FloatArray, HeadPose
 from ..errors import InputError
 
 NEAR_M = 1e-6
@@ -25,6 +26,28 @@ class Viewpoint:
     camera: Camera
     extrapolated: bool
     azimuth: float
+
+
+def training_poses(clip: Clip) -> list[HeadPose]:
+    """Tracked poses of the training timesteps, in order."""
+    return [clip.poses[t] for t in sorted({key.timestep for key in clip.splits["train"]})]
+
+
+def typical_pose(poses: Sequence[HeadPose]) -> HeadPose:
+    """The recorded pose whose expression is nearest to the mean; a real pose, so that its parts are consistent."""
+    expressions = np.array([pose.expression for pose in poses], np.float64)
+    return poses[int(np.argmin(np.linalg.norm(expressions - expressions.mean(axis=0), axis=1)))]
+
+
+def head_center(clip: Clip) -> FloatArray:
+    """(3,) centre of the head's bounding box in its typical training pose, metres."""
+    head, pose = clip.head, typical_pose(training_poses(clip))
+    coefficients = np.asarray(clip.shape, np.float64)
+    shaped = head.template + head.shape_basis[..., : len(coefficients)] @ coefficients
+    joint = head.joint_regressor[0] @ shaped
+    rotation, _ = cv2.Rodrigues(np.asarray(pose.rotation, np.float64))
+    middle = (shaped.min(axis=0) + shaped.max(axis=0)) / 2
+    return np.asarray(rotation @ (middle - joint) + joint + pose.translation)
 
 
 def turntable(
@@ -47,8 +70,6 @@ def turntable(
     beyond_degrees : float
         Maximum angle of views beyond the outermost cameras on either side, in [0, 180).
     """
-    if not cameras:
-        raise InputError("turntable", "cameras", "at least one", "none")
     first = cameras[0]
     sized = [camera.resized(first.width, first.height) for camera in cameras]
     focal = np.array([[camera.K[0, 0], camera.K[1, 1]] for camera in sized])

@@ -7,9 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ..engine.store import RunFolder
 from ..errors import InputError
@@ -17,6 +15,9 @@ from ..io.documents import checked, read_json, shown
 from ..io.files import check_name, write_json
 from ..rows import ALL, FRAME, FULL
 from ..specs import MAX_DIGITS, MetricSpec
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 AVATAR = "avatar"
 Captures = Literal["same", "remade"]

@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 from ..errors import ExitCode, InputError, shortened
 from ..io.files import check_writable, write_text
 from ..io.style import escape_markdown
-from ..options import DependentOptions
 from ..specs import CommandResult
 from .baseline import MACHINE, Baseline, Captures, ResultKey, Results, Tolerance, read_results
 
@@ -281,73 +280,45 @@ def _xml(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
-@dataclass(frozen=True, kw_only=True)
-class BaselineOptions:
-    """Comparison of a run with a baseline file."""
-
-    baseline: str | None = None
-    """Compare one run, or what `headbench evaluate` wrote, with this baseline file (JSON), which is kept under version
-    control. Exit code 0: no value is worse; 1: a value is worse; 3: results or baseline missing or invalid.
-    """
-
-    update: bool = False
-    """With --baseline: write the results into the file instead of judging them; tolerances that it has are kept."""
-
-    captures: Captures | None = None
-    """With --update: `same` (default) requires captures with the same fingerprint; `remade` is for captures
-    that are synthesised again for every run: everything except the fingerprint must be the same."""
-
-    judge_speed: bool = False
-    """With --baseline: also judge metrics that depend on the machine and its load (frames per second, milliseconds, training
-    time, memory), where the baseline was measured on a machine of the same kind. Without it they are shown, but do not affect
-    the exit code."""
-
-    junit: str | None = None
-    """With --baseline: also write a JUnit XML file: one test case for every task, method, subject and metric."""
-
-    markdown: str | None = None
-    """With --baseline: also write a Markdown summary."""
-
-
-DEPENDENT = (
-    DependentOptions(("update", "captures", "judge_speed", "junit", "markdown"), "baseline"),
-    DependentOptions(("captures",), "update"),
-    DependentOptions(("judge_speed", "junit", "markdown"), "update", False),
-)
-"""Options that have no effect without, or with, another one."""
-
-
-def compare_with_baseline(run: Path, baseline: Path, settings: BaselineOptions) -> CommandResult:
+def compare_with_baseline(
+    run: Path,
+    baseline: Path,
+    *,
+    update: bool = False,
+    captures: Captures | None = None,
+    judge_speed: bool = False,
+    junit: str | None = None,
+    markdown: str | None = None,
+) -> CommandResult:
     """Compare a run with a committed baseline: exit code 1 if a number got worse, 3 if one is missing.
 
     Results or a baseline that are missing or invalid are a finding too, with exit code 3, so that CI does not
     take them for a usage error. Nothing is written then but the reports asked for, which say so.
     """
-    for option, path in (("--junit", settings.junit), ("--markdown", settings.markdown)):
+    for option, path in (("--junit", junit), ("--markdown", markdown)):
         if path is not None:
             check_writable(Path(path), option)
             Path(path).unlink(missing_ok=True)  # a report of an earlier run could be mistaken for this one's
-    if settings.update:
+    if update:
         check_writable(baseline, "--baseline")
     try:
-        return _update(run, baseline, settings) if settings.update else _judge(run, baseline, settings)
+        if update:
+            return _update(run, baseline, captures)
+        result, xml, text = _judge(run, baseline, judge_speed)
     except InputError as error:
-        _write_reports(settings, failed_junit(str(error)), failed_markdown(str(error)))
-        return CommandResult(
-            f"Gate: missing or invalid: {error}", {"error": str(error)}, False, ExitCode.NO_VERDICT
-        )
-
-
-def _write_reports(settings: BaselineOptions, junit: str, markdown: str) -> None:
-    """Write the requested reports."""
-    for path, text in ((settings.junit, junit), (settings.markdown, markdown)):
+        xml, text = failed_junit(str(error)), failed_markdown(str(error))
+        message = f"Gate: missing or invalid: {error}"
+        result = CommandResult(message, {"error": str(error)}, False, ExitCode.NO_VERDICT)
+    for path, content in ((junit, xml), (markdown, text)):
         if path is not None:
-            write_text(Path(path), text)
+            write_text(Path(path), content)
+    return result
 
 
-def _judge(run: Path, baseline_file: Path, settings: BaselineOptions) -> CommandResult:
+def _judge(run: Path, baseline_file: Path, speed: bool) -> tuple[CommandResult, str, str]:
+    """The result, and its reports as JUnit XML and Markdown."""
     baseline, results = Baseline.read(baseline_file), read_results(run)
-    verdicts = judge(results, baseline, speed=settings.judge_speed)
+    verdicts = judge(results, baseline, speed=speed)
     code = exit_code(verdicts)
     changes = environment_changes(baseline.environment, results.environment)
     notes = [*unjudged_notes(verdicts), *(f"Environment changed: {change}." for change in changes)]
@@ -358,19 +329,19 @@ def _judge(run: Path, baseline_file: Path, settings: BaselineOptions) -> Command
         notes.append(f"Unavailable here as in the baseline: {len(unavailable)} numbers.")
     if any(verdict.outcome in ("improved", "new") for verdict in verdicts) and code == 0:
         notes.append("The baseline can be brought up to date with --update.")
-    _write_reports(settings, to_junit(verdicts, notes), to_markdown(verdicts, code, notes))
     data = {
         "code": code,
         "verdicts": [{**asdict(v), "place": str(v.place), "change": v.change} for v in verdicts],
         "environment_changes": changes,
     }
-    return CommandResult(to_text(verdicts, code, notes), data, code == 0, code)
+    result = CommandResult(to_text(verdicts, code, notes), data, code == 0, code)
+    return result, to_junit(verdicts, notes), to_markdown(verdicts, code, notes)
 
 
-def _update(run: Path, path: Path, settings: BaselineOptions) -> CommandResult:
+def _update(run: Path, path: Path, captures: Captures | None) -> CommandResult:
     earlier = Baseline.read(path) if path.exists() else None
     results = read_results(run)
-    baseline = Baseline.of(results, earlier, settings.captures)
+    baseline = Baseline.of(results, earlier, captures)
     verdicts = judge(results, earlier) if earlier else []
     gone = sorted(earlier.values.keys() - baseline.values.keys()) if earlier else []
     before = earlier.frames if earlier else {}

@@ -23,6 +23,9 @@ from ..errors import HeadbenchError, InputError, UnavailableError
 MAX_NAME_BYTES = 120
 """Maximum length of a subject, sequence or camera name; file names combine several and are limited to 255 bytes."""
 
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""System errors that would affect every other file, too."""
+
 ROOM_BYTES = 64 * 2**10
 """Less free space than this counts as a full disk."""
 
@@ -42,7 +45,6 @@ def atomic_path(path: Path) -> Iterator[Path]:
     ``path`` is replaced, not followed.
     """
     _check_target(path)
-    check_inside(path.parent)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
@@ -76,54 +78,6 @@ def _flush(path: Path) -> None:
         os.close(handle)
 
 
-_roots: list[Path] = []
-
-
-@contextmanager
-def output_inside(root: Path) -> Iterator[None]:
-    """Within the block, refuse to write through links that point out of ``root``, which may be another user's
-    folder."""
-    _roots.append(root)
-    try:
-        yield
-    finally:
-        _roots.remove(root)
-
-
-def check_inside(folder: Path) -> None:
-    """Raise `InputError` for a folder below one of `output_inside` that is, or is behind, a link out of it."""
-    given = os.path.abspath(folder)
-    for root in _roots:
-        if _below(given, os.path.abspath(root)):
-            real = os.path.realpath(given)
-            if not _below(real, os.path.realpath(root)):
-                remedy = "Remove the link; nothing is written outside of the output folder."
-                raise InputError(folder, "", f"a folder inside {root}", f"a link to {real}", remedy)
-
-
-def refuse_links(folder: Path) -> None:
-    """Raise `InputError` for links that point out of a folder that is not written by `atomic_path`."""
-    check_inside(folder)
-    for root, folders, names in os.walk(folder):
-        for path in (os.path.join(root, name) for name in (*folders, *names)):
-            if os.path.islink(path) and not _below(os.path.realpath(path), os.path.realpath(folder)):
-                raise InputError(path, "", f"files inside {folder}", "a link out of it", "Remove the link.")
-
-
-def _below(path: str, root: str) -> bool:
-    return os.path.commonpath([path, root]) == root
-
-
-def no_link(path: str, flags: int) -> int:
-    """Open as `os.open` does, but never through a link; an ``opener`` for `open`."""
-    try:
-        return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
-    except OSError as error:
-        if error.errno != errno.ELOOP:
-            raise
-        raise InputError(path, "", "a file", "a link", "Remove it.") from error
-
-
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically (UTF-8)."""
     with atomic_path(path) as temporary:
@@ -138,10 +92,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """Write `json_text` of a value atomically."""
-    text = json_text(value)
-    if "\\ud" in text:
-        check_utf8(json.dumps(json.loads(text), ensure_ascii=False), path, "", "names")
-    write_text(path, text)
+    write_text(path, json_text(value))
 
 
 def json_text(value: Any) -> str:
@@ -150,16 +101,6 @@ def json_text(value: Any) -> str:
     Raises `ValueError` for a non-finite number, which JSON cannot represent.
     """
     return json.dumps(value, indent=1, default=to_jsonable, allow_nan=False) + "\n"
-
-
-def check_utf8(text: str, source: str | os.PathLike[str], key: str, what: str) -> None:
-    """Raise `InputError` for text with file names in another encoding, which JSON, Parquet and other libraries do not take."""
-    try:
-        text.encode()
-    except UnicodeEncodeError as error:
-        found = text[max(0, error.start - 40) : error.end + 40]
-        remedy = "Rename the file or the folder, for example with convmv."
-        raise InputError(source, key, f"{what} in UTF-8", found, remedy) from error
 
 
 def check_writable(path: Path, option: str) -> None:
@@ -246,7 +187,6 @@ def check_room(folder: Path) -> None:
 
 @contextmanager
 def _writable(path: Path, option: str, what: str) -> Iterator[None]:
-    check_utf8(os.path.abspath(path), "command line", option, f"the path of {what}")
     try:
         yield
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
@@ -300,7 +240,7 @@ def reading(path: str | os.PathLike[str], expected: str, key: str = "", remedy: 
     except HeadbenchError:
         raise
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if isinstance(error, OSError) and error.errno in FULL_DISK:
             raise
         raise InputError(path, key, expected, _words(error), remedy) from error
 

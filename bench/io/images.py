@@ -144,15 +144,6 @@ _PNG_TABLE = 3
 _PNG_END, _JPEG_END = b"IEND\xaeB`\x82", b"\xff\xd9"
 _TAIL_BYTES = 64  # some encoders add padding after the end marker
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)  # does not occur in the data of a scan
-_FOREIGN = {
-    rb"....ftyp": "HEIF, AVIF or video",
-    rb"\x00\x00\x00\x0cJXL|\xff\x0a": "JPEG XL",
-    rb"v/1\x01": "OpenEXR",
-    rb"#\?RADIANCE": "Radiance HDR",
-    rb"\x00\x05\x16\x07": "AppleDouble (a ._ file of macOS)",
-    rb"version https://git-lfs": "Git LFS pointer",
-}
-"""Other files that Pillow does not know, by their first bytes."""
 
 
 @dataclass(frozen=True)
@@ -233,15 +224,12 @@ def _header(path: Path, stream: BinaryIO) -> ImageInfo:
     if not head:
         raise InputError(path, "", "an image", "an empty file")
     expected, remedy = "a PNG or JPEG image", "Convert it, for example to PNG."
-    foreign = [name for start, name in _FOREIGN.items() if re.match(start, head, re.DOTALL)]
-    if foreign:
-        raise InputError(path, "", expected, f"{foreign[0]} data", remedy)
     stream.seek(0)
     with reading(path, expected):
         try:
             image = Image.open(stream)
         except UnidentifiedImageError as error:
-            raise InputError(path, "", expected, f"a file that starts with {head[:4]!r}", remedy) from error
+            raise InputError(path, "", expected, f"a file that starts with {head[:16]!r}", remedy) from error
     if image.format not in ("PNG", "JPEG", "MPO"):  # MPO: a JPEG with previews behind it
         raise InputError(path, "", expected, f"{image.format} data", remedy)
     info = _png_info(path, image, head) if image.format == "PNG" else _jpeg_info(path, image)

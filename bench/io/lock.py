@@ -3,7 +3,6 @@ results."""
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import json
 import os
@@ -16,7 +15,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from ..errors import InputError
-from .files import TEMPORARY, check_inside, no_link, output_inside, removed_if_empty
+from .files import TEMPORARY, removed_if_empty
 
 LOCK_FILE = "run.lock"
 
@@ -26,11 +25,9 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
     """Lock ``folder`` within the block; the lock file names the owner.
 
     The lock ends with its process: the file of a killed process locks nobody out. While locked, temporary files of
-    killed processes are removed, and nothing is written through links out of the folder. ``beside`` creates the lock
-    file beside the folder, for folders that must be empty. A new folder without content is removed.
+    killed processes are removed. ``beside`` creates the lock file beside the folder, for folders that must be empty. A new folder without content is removed.
     """
     path = folder.resolve().parent / f".{folder.resolve().name}.lock" if beside else folder / LOCK_FILE
-    check_inside(folder)
     with removed_if_empty(folder):
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = _acquire(path)
@@ -40,8 +37,7 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
                 json.dumps({"process": os.getpid(), "host": platform.node(), "since": now}) + "\n"
             )
             remove_temporaries(folder)
-            with output_inside(folder):
-                yield
+            yield
         finally:
             path.unlink(missing_ok=True)  # while still locked: who opened it before sees that it is gone
             lock.release()
@@ -50,11 +46,11 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
 def is_locked(folder: Path) -> bool:
     """Whether a process holds the lock of ``folder``, which may be read-only here."""
     try:
-        with open(folder / LOCK_FILE, opener=no_link) as stream:
+        with open(folder / LOCK_FILE) as stream:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    except (OSError, InputError):
+    except OSError:
         return False
     return False
 
@@ -75,10 +71,6 @@ def _acquire(path: Path) -> FileLock:
     except Timeout:
         remedy = "Wait for it to end, or choose another folder."
         raise InputError(path, "", "a folder that no other process works in", _owner(path), remedy) from None
-    except OSError as error:
-        if error.errno != errno.ELOOP:
-            raise
-        raise InputError(path, "", "a file", "a link", "Remove it.") from error
     return lock
 
 

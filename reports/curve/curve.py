@@ -12,11 +12,10 @@ from fractions import Fraction
 from itertools import product
 from pathlib import Path
 from statistics import fmean
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import tyro
-from matplotlib.axes import Axes
 
 from ...bench.condition import Condition
 from ...bench.contracts import Budget, FloatArray, FrameKey, Progress, no_progress
@@ -33,6 +32,9 @@ from ..drawing import MARKERS, TEXT_POINTS, cost_axis, plot_file, show_missing, 
 from ..runs import RunData
 from ..statistics.comparisons import LEAST_SUBJECTS, half_width, interval
 from ..writers import csv_text, pipe_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 HELD_OUT: Mapping[str, str] = {"novel_view": "camera", "self_reenactment": "timesteps"}
 """Held-out data by task."""

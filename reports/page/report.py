@@ -23,10 +23,8 @@ from ...bench.io.style import SHAPES, policy_hash, stylesheet
 from ...bench.protocol import TASK_TITLES
 from ...bench.rows import FULL
 from ...bench.specs import CommandResult, MetricSpec, command
-from ..aggregate import summarise
+from ..aggregate import LATENCY, SPEED, STORAGE, pareto_front, summarise
 from ..drawing import colour_map
-from ..papers import as_printed, printed_tables
-from ..pareto.command import LATENCY, SIZE, SPEED, pareto_front
 from ..runs import FrameSelection, RunSet
 from ..statistics.command import compare_methods
 from ..table_report import layouts, table_of
@@ -203,6 +201,8 @@ def page_text(
 
 def _printed(runs: RunSet, name: str) -> list[TitledTable]:
     """The runs in the form of a paper's tables with the same tasks. Raises `InputError` if there is none."""
+    from ..papers import as_printed, printed_tables
+
     tables, refused = [], None
     for table in printed_tables(name, None):
         try:
@@ -388,7 +388,7 @@ def _plots(runs: RunSet, metrics: Sequence[MetricSpec]) -> list[dict[str, Any]]:
 def _cost(runs: RunSet, label: str, cost: str) -> float | None:
     """Size or median frame time, or the inverse of the mean rate if there is no median, as in `ParetoPoint`."""
     if cost == "megabytes":
-        return summarise(runs.rows, label, SIZE, "").value
+        return summarise(runs.rows, label, STORAGE, "").value
     milliseconds, rate = (summarise(runs.rows, label, name, "").value for name in (LATENCY, SPEED))
     return milliseconds if milliseconds is not None or not rate else 1000.0 / rate
 

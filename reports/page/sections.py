@@ -17,14 +17,13 @@ from markupsafe import Markup
 
 from ...bench.engine.stored import training_losses
 from ...bench.errors import HeadbenchError, InputError
-from ...bench.io.files import check_inside, entries, write_text
+from ...bench.io.files import entries, write_text
 from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
 from ...bench.registry import get
 from ...bench.rows import ALL
 from ...bench.specs import MethodSpec, MetricSpec
-from ..aggregate import mechanisms, summarise
-from ..pareto.command import SIZE, SPEED
+from ..aggregate import SPEED, STORAGE, mechanisms, summarise
 from ..runs import RunData, RunSet
 from ..statistics.comparisons import LEVEL, subjects_needed
 from ..tables import BELOW_CAUSES, not_better
@@ -120,7 +119,7 @@ def _sentence(
 def _costs(runs: RunSet, names: Sequence[str]) -> list[Markup]:
     """The smallest and the fastest method, each with the next one."""
     specs, sentences = {spec.name: spec for spec in runs.metrics}, []
-    for metric, what in ((SIZE, "smallest"), (SPEED, "fastest")):
+    for metric, what in ((STORAGE, "smallest"), (SPEED, "fastest")):
         scores = _scores(runs, names, specs[metric], "") if metric in specs else []
         if len(scores) > 1:
             (first, value), (second, other) = scores[:2]
@@ -200,7 +199,6 @@ def check_folder(folder: Path) -> None:
 
 def write_pictures(folder: Path, files: Sequence[PictureFile]) -> None:
     """Write the missing files; those of an earlier page are kept until `remove_others`."""
-    check_inside(folder / FOLDER)
     for file in files:
         write_text(folder / file.name, file.text)
 

@@ -17,8 +17,7 @@ from ...bench.engine.config import AvatarFolder, RunConfig
 from ...bench.engine.store import Cell
 from ...bench.engine.stored import open_avatar
 from ...bench.errors import InputError
-from ...bench.experiments.extremes import head_center
-from ...bench.experiments.viewpoints import turntable
+from ...bench.experiments.viewpoints import head_center, turntable
 from ...bench.io.images import browser_encoder, quantise, read_png, write_browser_video, write_png
 from ...bench.io.provenance import COMPOSITE, RENDER
 from ...bench.options import DependentOptions

@@ -14,7 +14,6 @@ import tyro
 
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.gate.command import DEPENDENT, BaselineOptions
 from ...bench.options import DependentOptions
 from ...bench.progress import counted
 from ...bench.protocol import TASK_TITLES
@@ -28,13 +27,29 @@ from .comparisons import LEVEL, PairedComparison, compare
 
 
 @dataclass(frozen=True)
-class CompareSettings(BaselineOptions):
+class CompareSettings:
     """Paired differences between methods of finished runs: size, interval, exact test, Holm's correction. With --baseline:
     comparison of one run with a baseline file, for CI.
     """
 
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of finished runs on the same frames. Seeds of a method are combined; other settings count as another method."""
+    baseline: str | None = None
+    """Compare one run, or what `headbench evaluate` wrote, with this baseline file (JSON), which is kept under version
+    control. Exit code 0: no value is worse; 1: a value is worse; 3: results or baseline missing or invalid."""
+    update: bool = False
+    """With --baseline: write the results into the file instead of judging them; tolerances that it has are kept."""
+    captures: Literal["same", "remade"] | None = None
+    """With --update: `same` (default) requires captures with the same fingerprint; `remade` is for captures
+    that are synthesised again for every run: everything except the fingerprint must be the same."""
+    judge_speed: bool = False
+    """With --baseline: also judge metrics that depend on the machine and its load (frames per second, milliseconds, training
+    time, memory), where the baseline was measured on a machine of the same kind. Without it they are shown, but do not affect
+    the exit code."""
+    junit: str | None = None
+    """With --baseline: also write a JUnit XML file: one test case for every task, method, subject and metric."""
+    markdown: str | None = None
+    """With --baseline: also write a Markdown summary."""
     against: Annotated[str | None, tyro.conf.arg(metavar="METHOD")] = None
     """Compare every method with this one only, instead of all pairs: with fewer comparisons, fewer subjects are needed."""
     metrics: tuple[str, ...] = ()
@@ -54,13 +69,11 @@ class CompareSettings(BaselineOptions):
     """Format of the output; csv adds uncorrected p-values and subjects won, --json also the difference of each subject."""
 
     dependent = (
-        *DEPENDENT,
+        DependentOptions(("update", "captures", "judge_speed", "junit", "markdown"), "baseline"),
+        DependentOptions(("captures",), "update"),
+        DependentOptions(("judge_speed", "junit", "markdown"), "update", False),
         DependentOptions(
-            (
-                *("against", "metrics", "trivial", "region", "sequences", "level", "equivalence"),
-                "format",
-                "details",
-            ),
+            ("against", "metrics", "trivial", "region", "sequences", "level", "equivalence", "format"),
             *("baseline", False),
         ),
     )
@@ -101,7 +114,15 @@ def compare_runs(settings: CompareSettings, progress: Progress = no_progress) ->
     if settings.baseline is not None:
         from ...bench.gate.command import compare_with_baseline
 
-        return compare_with_baseline(Path(settings.runs[0]), Path(settings.baseline), settings)
+        return compare_with_baseline(
+            Path(settings.runs[0]),
+            Path(settings.baseline),
+            update=settings.update,
+            captures=settings.captures,
+            judge_speed=settings.judge_speed,
+            junit=settings.junit,
+            markdown=settings.markdown,
+        )
     part = FrameSelection(settings.region, settings.sequences)
     runs = RunSet.read([Path(folder) for folder in settings.runs], part)
     return compare_methods(

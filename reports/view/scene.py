@@ -21,8 +21,8 @@ from ...bench.engine.plan import make_jobs
 from ...bench.engine.store import RunFolder
 from ...bench.engine.stored import avatar_folder, open_avatar
 from ...bench.errors import HeadbenchError, InputError
-from ...bench.experiments.extremes import head_center, training_poses
 from ...bench.experiments.reenactment import AT_ORIGIN, RigidMean, check_heads, retarget
+from ...bench.experiments.viewpoints import head_center, training_poses
 from ...bench.expressions import Expression, expressions_of
 from ...bench.options import DependentOptions
 

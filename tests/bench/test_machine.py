@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -116,7 +115,6 @@ def test_quotas_of_cgroups_limit_cores_and_memory(
     assert os.environ.get("OMP_NUM_THREADS") == (None if threads == 8 else str(threads))
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
 def test_accelerators_are_what_the_driver_reports(monkeypatch, tmp_path):
     program = tmp_path / "nvidia-smi"
     program.write_text("#!/bin/sh\necho 'Abacus 9, 550.1, 9 MiB, 700.00 W, 345 MHz, 1980 MHz'\n")

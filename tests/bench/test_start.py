@@ -11,6 +11,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 from headbench.bench.listing import ListSettings
+from headbench.bench.registry import discover
 
 CONSOLE_SCRIPT = "import sys\nfrom headbench.bench.start import main\nsys.exit(main())\n"
 LINES = {
@@ -156,6 +157,11 @@ PARSER |= {f"headbench.{name}" for name in ("bench.comparison", "reports.page.se
 HEAVY = "cv2 matplotlib nlopt pandas PIL psutil pyarrow pycolmap pydantic pymeshlab rich safetensors scipy skimage"
 USED_BY_COMMANDS = {*HEAVY.split(), "sklearn", "torch", "torchmetrics"}
 
+HELPS = [
+    f"{name} --help"
+    for name, command in sorted(discover("commands").items())
+    if command.spec.function.startswith(("headbench.bench.", "headbench.reports."))
+]
 
 UNUSED = [
     (["--version", "--help", "prepare --help"], USED_BY_COMMANDS | PARSER),
@@ -164,6 +170,7 @@ UNUSED = [
         USED_BY_COMMANDS,
     ),
     (LISTS_OF_FILES, USED_BY_COMMANDS - {"pydantic"}),
+    (HELPS, USED_BY_COMMANDS - {"pydantic", "cv2", "PIL"}),
 ]
 """Command lines, and what none of them nor an earlier one imports."""
 

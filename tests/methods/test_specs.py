@@ -4,15 +4,10 @@ from dataclasses import replace
 
 import pytest
 
+from headbench.bench.comparison import DemoConfig, demo_run_config
 from headbench.bench.configuration import build
 from headbench.bench.contracts import Budget
-from headbench.bench.engine.config import (
-    DemoConfig,
-    RunConfig,
-    demo_run_config,
-    resolve_method,
-    resolve_methods,
-)
+from headbench.bench.engine.config import RunConfig, resolve_method, resolve_methods
 from headbench.bench.errors import InputError
 from headbench.bench.registry import resolve
 from headbench.methods.flashavatar.spec import FLASHAVATAR, FlashAvatarConfig

@@ -18,7 +18,7 @@ import torch
 from ....bench.contracts import Camera, Clip, FloatArray, HeadPose, Progress, no_progress
 from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE
 from ....bench.errors import InputError
-from ....bench.experiments.extremes import head_center
+from ....bench.experiments.viewpoints import head_center
 from ....bench.expressions import expressions_of
 from ....bench.io.files import check_writable, write_text
 from ....bench.io.images import encode_image, quantise

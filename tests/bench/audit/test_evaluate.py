@@ -16,8 +16,7 @@ from headbench.bench.audit.evaluate import EvaluateSettings, evaluate_folder
 from headbench.bench.audit.frames import Render, check_truth, composited
 from headbench.bench.contracts import FrameKey
 from headbench.bench.engine.store import RunFolder
-from headbench.bench.errors import HeadbenchError, InputError
-from headbench.bench.executors.schedule import Schedule
+from headbench.bench.errors import InputError
 from headbench.bench.io.images import read_png, write_png
 from headbench.bench.rows import ALL, COLUMNS
 
@@ -56,12 +55,6 @@ def test_images_of_a_run_score_alike_in_every_layout(run, renders, images, tmp_p
         other = tmp_path / f"other-{number}"
         shutil.copytree(renders, other / layout, dirs_exist_ok=True)
         assert scored(other, run, tmp_path / f"out-{number}").equals(theirs)
-
-
-def test_a_failure_in_an_executor_names_its_reason_and_log(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(Schedule, "run_all", lambda self, tasks: {"command": "It was killed."})
-    with pytest.raises(HeadbenchError, match=r"It was killed\. Its log is .*job\.log"):
-        evaluate_folder(options(tmp_path / "none", run, tmp_path / "out", executor="processes"))
 
 
 def test_the_rows_stand_in_one_table_with_the_runs_and_verify(run, images, tmp_path):

@@ -640,34 +640,6 @@ def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
     assert "'failing' of other 1 failed" in messages[1]
 
 
-REPLACED = ("rows.parquet", "contact_sheet.png", "report.html", "tables")
-REFUSED = ("run.json", "protocols", "subject1/toy/seed-0/avatar/level.txt", "subject1/toy/seed-0/renders")
-
-
-@pytest.mark.parametrize(("places", "expected"), [(REPLACED, 0), *(((place,), 2) for place in REFUSED)])
-def test_a_received_run_is_not_written_through_its_links(
-    config, monkeypatch, tmp_path, places, expected, capsys
-):
-    """A file is replaced, a report left out; a folder that results go into is refused."""
-    monkeypatch.undo()
-    monkeypatch.syspath_prepend(Path(__file__).parents[1])
-    words = ["run", "--data", config.data, "--out", config.out, "--methods", "toy_plugin:METHOD"]
-    words += ["--set", "reader=toy_plugin:READER", "--set", "metrics=psnr"]
-    outside = tmp_path / "outside"
-    outside.mkdir()
-    for place in places:
-        link, target = Path(config.out) / place, outside / Path(place).name
-        link.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text("victim") if link.suffix else target.mkdir()
-        link.symlink_to(target)
-    code = cli.main(words)
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    for target in outside.iterdir():
-        assert target.read_text() == "victim" if target.is_file() else not list(target.iterdir())
-    assert code == expected, error
-
-
 def test_planned_cells_have_their_state_and_nothing_is_trained(config, toy, finished):
     finished(config)
     changes = {"preset": "fast", "settings": {"toy": {"budget": {"iterations": 3}}}}

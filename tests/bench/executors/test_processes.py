@@ -11,12 +11,12 @@ from headbench.bench import cli
 from headbench.bench.condition import PLAIN, Condition, Named
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.run import _Run
-from headbench.bench.engine.store import RunFolder
+from headbench.bench.engine.store import RunFolder, read_outcome, update_record
 from headbench.bench.errors import InputError
 from headbench.bench.executors.schedule import Processes, Schedule
 from headbench.bench.executors.settings import Execution
 from headbench.bench.executors.status import CellState, time_left
-from headbench.bench.executors.task import Task, read_outcome, update_record
+from headbench.bench.executors.task import Task
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import is_locked

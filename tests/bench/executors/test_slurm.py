@@ -14,12 +14,12 @@ import pytest
 from submitit.helpers import DelayedSubmission
 
 from headbench.bench import cli
-from headbench.bench.engine.store import RunFolder
+from headbench.bench.engine.store import RunFolder, read_outcome
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.executors import slurm as module
 from headbench.bench.executors.settings import Execution, SlurmSettings
 from headbench.bench.executors.slurm import queue, read_submitted, run_job, submitted_path
-from headbench.bench.executors.task import Task, read_outcome
+from headbench.bench.executors.task import Task
 from headbench.bench.io.files import write_json
 from headbench.tests.bench.executors import cluster
 from headbench.tests.bench.executors.cluster import wait_for

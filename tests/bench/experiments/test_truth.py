@@ -13,9 +13,10 @@ from headbench.bench.engine.config import RunConfig, resolve_cells
 from headbench.bench.engine.plan import make_jobs
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.experiments import extremes
-from headbench.bench.experiments.extremes import ExtremesSettings, head_center
+from headbench.bench.experiments.extremes import ExtremesSettings
 from headbench.bench.experiments.refit import FrameFit, refit
 from headbench.bench.experiments.truth import TRUTH_LIMITS, TruthJudge, TruthPair, TruthPictures
+from headbench.bench.experiments.viewpoints import head_center
 from headbench.bench.io.images import quantise
 from headbench.datasets.open import open_clip
 from headbench.datasets.synthetic.capture import synthesize

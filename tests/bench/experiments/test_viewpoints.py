@@ -103,12 +103,10 @@ def test_every_view_is_a_rigid_camera_that_sees_the_head(angles, count, beyond):
         assert np.allclose([x / w, y / w], [50, 70], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "rig", [[], [Camera("", 4, 4, np.eye(3), look_at(CENTER, CENTER + UP, np.eye(3)[0]))]]
-)
-def test_no_cameras_or_one_in_the_head_are_refused(rig):
+def test_a_camera_in_the_head_is_refused():
+    camera = Camera("", 4, 4, np.eye(3), look_at(CENTER, CENTER + UP, np.eye(3)[0]))
     with pytest.raises(InputError):
-        turntable(rig, CENTER, 4, 0.0)
+        turntable([camera], CENTER, 4, 0.0)
 
 
 def test_the_common_target_is_where_the_cameras_look():

@@ -1,32 +1,25 @@
 import errno
 import os
 import re
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from headbench.bench.engine.config import build_run_config
 from headbench.bench.errors import InputError, UnavailableError, is_damage
 from headbench.bench.io import files
-from headbench.bench.io.documents import checked, read_json
 from headbench.bench.io.files import (
     KINDS,
     MAX_NAME_BYTES,
     atomic_path,
     check_kind,
     check_name,
-    check_output_folder,
     check_writable,
     digest,
     digest_file,
     expand_home,
-    output_inside,
     reading,
-    refuse_links,
-    write_json,
     write_text,
 )
 
@@ -125,38 +118,6 @@ def test_a_link_is_replaced_and_its_target_left_alone(tmp_path, target):
     assert not (tmp_path / "nothing").exists()
 
 
-@pytest.mark.parametrize("depth", ["link/a.txt", "link/new/folder/a.txt", "below/link/a.txt"])
-def test_nothing_is_written_through_a_folder_that_leads_out(tmp_path, depth):
-    root, outside = tmp_path / "root", tmp_path / "outside"
-    outside.mkdir()
-    for link in (root / "link", root / "below" / "link"):
-        link.parent.mkdir(parents=True, exist_ok=True)
-        link.symlink_to(outside)
-    with output_inside(root), pytest.raises(InputError, match="a link to .*outside"):
-        write_text(root / depth, "")
-    assert list(outside.iterdir()) == []
-
-
-def test_an_output_folder_may_itself_be_a_link(tmp_path):
-    (tmp_path / "disk" / "b").mkdir(parents=True)
-    (tmp_path / "root").symlink_to(tmp_path / "disk")
-    (tmp_path / "disk" / "inside").symlink_to(tmp_path / "disk" / "b")
-    with output_inside(tmp_path / "root"):
-        write_text(tmp_path / "root" / "a", "a")
-        write_text(tmp_path / "root" / "inside" / "a", "a")
-    assert (tmp_path / "disk" / "b" / "a").exists()
-
-
-def test_links_that_lead_out_are_refused_for_writers_of_others(tmp_path):
-    link = tmp_path / "avatar" / "link"
-    link.parent.mkdir()
-    for target in ("a", "none", "../outside"):
-        link.unlink(missing_ok=True)
-        link.symlink_to(target)
-        with pytest.raises(InputError, match="a link out of it") if ".." in target else nullcontext():
-            refuse_links(link.parent)
-
-
 @pytest.mark.parametrize(("kind", "mark"), [(kind, mark) for kind in KINDS for mark in KINDS[kind]])
 def test_a_folder_of_another_kind_is_refused(tmp_path, kind, mark):
     check_kind(tmp_path / "new")
@@ -180,28 +141,6 @@ def test_results_are_not_written_over_by_a_named_file(tmp_path):
         with pytest.raises(InputError, match="--out: expected a file that is new"):
             check_writable(tmp_path / name, "--out")
     check_writable(tmp_path / "target.md", "--out")  # a table of an earlier time
-
-
-LATIN = os.fsdecode("Größe".encode("latin-1"))
-
-
-@pytest.mark.parametrize(
-    ("name", "fits"), [(LATIN, False), ("Größe\n#1 %41 \N{PARROT}", True), ("C:\\udcf6", True)]
-)
-def test_what_is_written_can_be_read_back(tmp_path, name, fits):
-    folder, json = tmp_path / name / "out", tmp_path / "run.json"
-    for write in (
-        lambda: write_json(json, {"data": [name]}),
-        lambda: check_output_folder(folder),
-        lambda: check_writable(tmp_path / name, "--out"),
-        lambda: build_run_config({"data": name, "out": "o"}, "run.yaml"),
-    ):
-        with nullcontext() if fits else pytest.raises(InputError, match="in UTF-8, found .*\\\\udcf6"):
-            write()
-    assert not folder.parent.exists()
-    assert json.exists() == fits
-    if fits:
-        assert checked(read_json(json), dict[str, list[str]], json) == {"data": [name]}
 
 
 def test_a_tilde_is_the_home_folder(monkeypatch):

@@ -11,7 +11,6 @@ import pytest
 from headbench.bench.errors import InputError
 from headbench.bench.io.files import TEMPORARY, check_output_folder
 from headbench.bench.io.lock import LOCK_FILE, is_locked, locked
-from headbench.bench.progress import log_to_file
 
 HOLDER = """
 import sys, time
@@ -51,21 +50,6 @@ def test_one_process_enters_once_and_a_damaged_lock_is_ignored(tmp_path):
         assert is_locked(tmp_path)
     assert not is_locked(tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", [LOCK_FILE, "run.log"])
-def test_lock_and_log_are_never_links(tmp_path, name):
-    victim, folder = tmp_path / "victim", tmp_path / "run"
-    victim.write_text("victim")
-    folder.mkdir()
-    (folder / name).symlink_to(victim)
-    with (
-        pytest.raises(InputError, match="expected a file, found a link"),
-        log_to_file(folder / "run.log"),
-        locked(folder),
-    ):
-        pytest.fail("went on")
-    assert victim.read_text() == "victim"
 
 
 def test_leftovers_of_killed_processes_are_removed(tmp_path):

@@ -174,8 +174,6 @@ def test_assignments_of_many_subjects_are_drawn(monkeypatch):
 
 def test_nothing_and_no_difference_reject_nothing():
     assert sign_flip_p([]) == sign_flip_p([0.0] * 9) == least_p(0) == 1
-    with pytest.raises(ValueError, match="finite"):
-        sign_flip_p([1.0, np.nan])
 
 
 @pytest.mark.parametrize(("comparisons", "subjects"), [(1, 6), (4, 8), (10, 9), (15, 10)])
@@ -236,33 +234,6 @@ def test_equivalence_is_two_one_sided_tests(mean):
 def test_equivalence_of_ten_alike_has_the_least_p():
     assert equivalence_p(np.zeros(10), 0.3) == 2**-10
     assert equivalence_p([], 0.3) == 1
-
-
-@pytest.mark.parametrize("margin", [0.0, -0.3, np.inf, np.nan])
-def test_a_margin_that_is_none_is_refused(margin):
-    with pytest.raises(ValueError, match="margin"):
-        equivalence_p([0.1], margin)
-
-
-@pytest.mark.parametrize("draw", ["normal", "laplace", "uniform"])
-def test_at_the_margin_equivalence_keeps_its_level(draw):
-    # Symmetric about the margin: the one-sided test is exact, at most 5 % are called equivalent.
-    draws = {"normal": {"scale": 0.2}, "laplace": {"scale": 0.2}, "uniform": {"low": -0.4, "high": 0.4}}
-    values = 0.3 + getattr(np.random.default_rng(0), draw)(size=(2_000, 8), **draws[draw])
-    share = np.mean([equivalence_p(each, 0.3) <= 0.05 for each in values])
-    assert share == pytest.approx(0.05, abs=3 * np.sqrt(0.05 * 0.95 / 2_000) + 2**-8)
-
-
-def test_equivalence_has_the_power_of_its_t_tests():
-    def by_t(values):
-        sides = [stats.ttest_1samp(values, s * 0.3, alternative=a) for s, a in ((-1, "greater"), (1, "less"))]
-        return max(side.pvalue for side in sides)
-
-    values = np.random.default_rng(2).normal(0, 0.25, (500, 10))
-    found = np.mean([equivalence_p(each, 0.3) <= 0.05 for each in values])
-    expected = np.mean([by_t(each) <= 0.05 for each in values])
-    assert expected > 0.8
-    assert found == pytest.approx(expected, abs=0.05)
 
 
 def test_equivalence_is_corrected_over_the_pairs():

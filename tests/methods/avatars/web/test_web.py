@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from headbench.bench.experiments.extremes import head_center
+from headbench.bench.experiments.viewpoints import head_center
 from headbench.bench.specs import ResolutionRule
 from headbench.datasets.open import open_clip
 from headbench.methods.avatars.web.export import decode, encode, training_images
