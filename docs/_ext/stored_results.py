@@ -2,13 +2,13 @@
 
 python docs/_ext/stored_results.py WHAT OUT .
 
-WHAT is demo, suite, profiles or faces (a run of one subject), further (a folder of runs) or curves (a folder of seconds and
-pictures); OUT is the folder of the run or runs. A block of a page is between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``.
+WHAT is demo, suite, profiles or faces (a run of one subject), further or mechanisms (a folder of runs) or curves (a folder of
+seconds and pictures); OUT is the folder of the run or runs. A block of a page is between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``.
 """
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import groupby, product
@@ -102,6 +102,9 @@ class StoredResults:
             (f"{DOCS}/protocols.md", "protocols"): choices(self.suite),
             (f"{DOCS}/protocols.md", "profiles"): choices(profiles),
             (f"{DOCS}/metrics.md", "faces"): to_markdown(table_of(faces)).strip(),
+            (f"{DOCS}/metrics.md", "mechanisms"): mechanisms(
+                {folder.name: self.read(folder) for folder in self.runs("mechanisms")}
+            ),
             (f"{DOCS}/methods/ours.md", "ablations"): differences(self.suite, lines, OURS),
             (f"{DOCS}/methods/rgbavatar.md", "further"): beside,
         }
@@ -188,6 +191,33 @@ def differences(runs: RunSet, methods: Sequence[str], reference: str) -> str:
     for name in (name for name in methods if name in runs.methods):
         found = [difference(runs, name, reference, *column) for column in columns]
         lines.append([f"`{name}`", *(each.text(2) for each in found), str(found[0].subjects)])
+    return pipe_table(lines)
+
+
+def mechanisms(runs: Mapping[str, RunSet]) -> str:
+    """How much of each avatar its mechanism changes, and PSNR in the face minus that of the ablation without it, by run."""
+    titles = [f"{name}: {what}" for name in runs for what in ("changes (%)", "worth (dB)")]
+    lines = [["Method", *titles], ["---", *["--:"] * len(titles)]]
+    labels = {label: None for each in runs.values() for label in each.methods}
+    for label in labels:
+        method, _, condition = label.partition("+")
+        ablation = f"{method}+{get('methods', method).mechanism.ablation}"
+        if condition and not label.startswith("ours+penalty"):
+            continue
+        cells = []
+        for each in runs.values():
+            without = next((name for name in each.methods if name.startswith(ablation)), "")
+            if label not in each.methods or not without:
+                cells += ["–", "–"]
+                continue
+            face = each.of(FrameSelection(FACE)).rows
+            worth = [
+                summarise(face, label, "psnr", task).value - summarise(face, without, "psnr", task).value
+                for task in each.tasks
+            ]
+            changed = summarise(each.rows, label, "dynamic_splats", "").value
+            cells += [f"{changed:.1f}", " / ".join(f"{value:+.2f}" for value in worth)]
+        lines.append([f"`{label}`", *cells])
     return pipe_table(lines)
 
 
