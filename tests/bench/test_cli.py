@@ -476,7 +476,7 @@ def test_a_run_takes_settings_and_executors_from_its_options(seen, tmp_path):
         *(((0,), "fast"), ((3, 1, 4), "fast"), ((7,), "of-a-plug-in"))
     ]
     assert [(e.executor, e.workers, e.slurm.partition) for _, e in seen] == [
-        *(("inline", None, None), ("processes", 3, None), ("slurm", None, "gpu"))
+        *(("auto", None, None), ("processes", 3, None), ("slurm", None, "gpu"))
     ]
 
 

@@ -23,6 +23,7 @@ from headbench.bench.engine import config as runner_config
 from headbench.bench.engine import run as runner
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import HeadbenchError, InputError, reason_of
+from headbench.bench.executors.settings import Execution
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json
 from headbench.bench.io.lock import locked
@@ -652,3 +653,26 @@ def test_planned_cells_have_their_state_and_nothing_is_trained(config, toy, fini
     runner.run(longer)
     (method,) = manifest_of(longer)["methods"]
     assert (method["config"]["level"], method["budget"]["iterations"]) == (0.25, 3)
+
+
+@pytest.mark.parametrize(
+    ("trainings", "cores", "gigabytes", "device", "workers"),
+    [
+        *((3, 2, 23, "cpu", 2), (2, 16, 23, "cpu", 2), (9, 16, 7, "cpu", 3)),
+        *((3, 1, 23, "cpu", None), (1, 2, 23, "cpu", None), (3, 2, 3, "cpu", None), (3, 2, 23, "cuda", None)),
+    ],
+)
+def test_trainings_on_cores_with_memory_run_at_once(
+    monkeypatch, trainings, cores, gigabytes, device, workers
+):
+    def job(trivial=False, is_trained=False):
+        method = SimpleNamespace(spec=SimpleNamespace(trivial=trivial))
+        return SimpleNamespace(source=None, method=method, cell=SimpleNamespace(is_trained=is_trained))
+
+    monkeypatch.setattr(runner, "processor_count", lambda: cores)
+    monkeypatch.setattr(runner, "memory", lambda: (10**12, gigabytes * 10**9))
+    jobs = [*(job() for _ in range(trainings)), job(trivial=True), job(is_trained=True)]
+    found = runner.chosen(
+        Execution("auto"), SimpleNamespace(jobs=jobs, config=SimpleNamespace(device=device))
+    )
+    assert (found.executor, found.workers) == ("processes" if workers else "inline", workers)

@@ -59,7 +59,7 @@ def make_run(plugin, run_of):
 
 
 def settings(run, **changes):
-    return CurveSettings(str(run), trust=True, **changes)
+    return CurveSettings(str(run), trust=True, **{"executor": "inline", **changes})
 
 
 def table(run):
