@@ -640,6 +640,17 @@ def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
     assert "'failing' of other 1 failed" in messages[1]
 
 
+def test_a_full_disk_is_no_failure_of_one_report(monkeypatch, toy):
+    def full(run):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(toy, "failing_report", full)
+    failing = Plugin("failing", "other 1", ReportSpec("failing", "", "toy_plugin:failing_report"))
+    monkeypatch.setattr(runner, "discover", lambda group: {"failing": failing})
+    with pytest.raises(OSError, match="No space left"):
+        runner.write_reports(SimpleNamespace())
+
+
 REPLACED = ("rows.parquet", "contact_sheet.png", "report.html", "tables")
 REFUSED = ("run.json", "protocols", "subject1/toy/seed-0/avatar/level.txt", "subject1/toy/seed-0/renders")
 
