@@ -191,7 +191,10 @@ def _codec(label: str, jobs: Sequence[Job]) -> str | None:
 
 
 def write_reports(run: FinishedRun) -> list[Path]:
-    """Write every registered report of a finished run. One that fails is logged and the others are written."""
+    """Write every registered report of a finished run. One that fails is logged and the others are written.
+
+    A full disk is an `OSError`.
+    """
     written: list[Path] = []
     for name, plugin in discover("reports").items():
         if plugin.spec is None:
@@ -200,6 +203,8 @@ def write_reports(run: FinishedRun) -> list[Path]:
             try:
                 written += resolve(plugin.spec.implementation)(run)
             except (HeadbenchError, OSError) as error:
+                if isinstance(error, OSError) and error.errno in FULL_DISK:
+                    raise
                 log.error("report %r of %s failed: %s; the rows are complete", name, plugin.origin, error)
             except Exception:
                 log.exception("report %r of %s failed; the rows are complete", name, plugin.origin)

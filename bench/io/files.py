@@ -198,9 +198,7 @@ def _writable(path: Path, option: str, what: str) -> Iterator[None]:
 
 def _try_to_write(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    # On systems that support it, this file has no name.
-    with tempfile.TemporaryFile(dir=folder, prefix=TEMPORARY):
-        pass
+    check_room(folder)
 
 
 def _check_target(path: Path) -> None:

@@ -370,8 +370,9 @@ FOLDER = "tracked"
 def with_tracking(
     clip: Clip, config: RunConfig, *, landmarks: str = "", embedding: str = "", seed: int = 0
 ) -> CaptureClip:
-    """The clip with the tracking of ``headbench track``, without the frames that it leaves out; estimated once and kept in
-    ``config.out``.
+    """The clip with the tracking of ``headbench track``, estimated once and kept in ``config.out``.
+
+    Training frames that the tracker leaves out are left out. Scored ones have the pose of the nearest timestep that is tracked.
 
     Parameters
     ----------
@@ -404,12 +405,16 @@ def with_tracking(
     sizes = {"S": capture.head.shape_basis.shape[2], "D": columns.size}
     stored = read_arrays(place, members, sizes)
     timesteps = stored["timesteps"].tolist()
-    poses = columns.poses(stored["poses"], capture.head, capture.subject, timesteps)
-    left_out = {key.timestep for key in capture.files}.difference(timesteps)
-    return without_timesteps(capture, left_out).derive(
+    poses = dict(zip(timesteps, columns.poses(stored["poses"], capture.head, capture.subject, timesteps)))
+    for lost in {key.timestep for key in capture.files}.difference(timesteps):
+        nearest = min(timesteps, key=lambda timestep: abs(timestep - lost))
+        poses[lost] = replace(poses[nearest], timestep=lost)
+    train = tuple(key for key in capture.splits["train"] if key.timestep in timesteps)
+    return capture.derive(
         "track",
         {**settings, "parameters": digest(stored["shape"], stored["poses"])},
         shape=stored["shape"],
         static_offset=np.zeros(capture.head.template.shape, np.float32),
-        poses=dict(zip(timesteps, poses)),
+        poses=poses,
+        splits={**capture.splits, "train": train},
     )

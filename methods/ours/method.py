@@ -42,13 +42,10 @@ from ..ops.planes import (
 )
 from ..ops.splats import activate, to_world
 from ..shared.avatar_files import (
-    SUBJECT_FILE,
     Subject,
     clip_mesh,
     finish_fit,
     read_stored,
-    save_shared_head,
-    write_subject,
 )
 from ..shared.capacity import JAW, CapacityPlan, CapacityPlanner
 from ..shared.loop import Fit
@@ -469,13 +466,10 @@ class Ours(TrainedMethod[OursConfig, OursAvatar]):
             appearance.stored(optimiser),
             *(appearance.plane_box, appearance.line_box, appearance.jaw_bases, config.lines.dynamic),
         )
-        subject = Subject.of(clip)
-        write_subject(out / SUBJECT_FILE, subject)
-        save_shared_head(out, clip.head)
         finish_fit(
             fit,
             outcome,
-            subject,
+            Subject.of(clip),
             clip.head,
             splats=len(training.binding),
             jaw_bases=len(appearance.jaw_bases),

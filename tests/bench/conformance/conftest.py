@@ -15,8 +15,9 @@ def outside(monkeypatch, tmp_path):
     folder.mkdir()
     for path in HERE.glob("outside_*.py"):
         (folder / path.name).write_text(path.read_text())
-    for page in ("docs/tutorials/own-method.md", "docs/howto/metric.md"):
-        code = re.search(r"```python\n# (\w+\.py)\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
+    for page in ("tutorials/own-method", "howto/metric", "howto/report", "howto/experiment"):
+        text = (ROOT / "docs" / f"{page}.md").read_text("utf-8")
+        code = re.search(r"```python\n# (\w+\.py)\n(.*?)```", text, re.DOTALL)
         (folder / code[1]).write_text(code[2])
     monkeypatch.syspath_prepend(folder)
     for path in folder.iterdir():

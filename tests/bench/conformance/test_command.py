@@ -198,18 +198,22 @@ def test_plugins_written_outside_import_the_root_alone(outside):
         assert {name for name in names if name.startswith("headbench")} <= {"headbench"}
 
 
-def test_an_experiment_written_outside_runs_its_conditions(outside, npz_capture, tmp_path, monkeypatch):
+def test_the_pages_experiment_and_report_show_each_condition(outside, npz_capture, tmp_path, monkeypatch):
+    import best
+    import noise
+
     monkeypatch.setattr("headbench.bench.api.reader_of", lambda data: "outside_reader:SPEC")
-    noise = headbench.Named("outside_experiment:NOISE", {"deviation": 40})
-    conditions = [headbench.PLAIN, headbench.Condition("noise-40", clip=noise)]
-    how = {"methods": ["mean-image"], "preset": "smoke", "metrics": ["psnr"], "conditions": conditions}
-    run = headbench.run(npz_capture, tmp_path / "run", **how)
-    rows = headbench.RunData.read(run).rows
-    how = {"metric": "psnr", "task": "self_reenactment", "region": "full", "seeds": headbench.ALL}
-    plain, noisy = (
-        rows.select(method=name, **how)["value"].mean() for name in ("mean-image", "mean-image+noise-40")
-    )
-    assert plain != noisy
+    how = {
+        "methods": ("mean-image",),
+        "preset": "smoke",
+        "deviations": (40.0,),
+        "progress": contracts.no_progress,
+    }
+    run = tmp_path / "run"
+    means = noise.run_noise(data=str(npz_capture), out=str(run), **how).data
+    assert means["mean-image"] != means["mean-image+noise-40"]
+    (file,) = best.write_best(run)
+    assert [frame["method"] for frame in json.loads(file.read_text())] == [*means]
 
 
 @pytest.fixture

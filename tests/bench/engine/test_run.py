@@ -641,6 +641,17 @@ def test_a_report_that_fails_stops_no_other(monkeypatch, toy, tmp_path, caplog):
     assert "'failing' of other 1 failed" in messages[1]
 
 
+def test_a_full_disk_is_no_failure_of_one_report(monkeypatch, toy):
+    def full(run):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(toy, "failing_report", full)
+    failing = Plugin("failing", "other 1", ReportSpec("failing", "", "toy_plugin:failing_report"))
+    monkeypatch.setattr(runner, "discover", lambda group: {"failing": failing})
+    with pytest.raises(OSError, match="No space left"):
+        runner.write_reports(SimpleNamespace())
+
+
 def test_planned_cells_have_their_state_and_nothing_is_trained(config, toy, finished):
     finished(config)
     changes = {"preset": "fast", "settings": {"toy": {"budget": {"iterations": 3}}}}

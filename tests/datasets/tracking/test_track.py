@@ -230,6 +230,21 @@ def test_the_clip_has_other_tracking_and_the_same_frames(clip, tmp_path, monkeyp
         assert 1e-5 < gap < 0.05
 
 
+def test_scored_frames_that_cannot_be_tracked_have_a_pose(clip, tmp_path, monkeypatch):
+    def without_first(capture, cameras, source, **how):
+        return SimpleNamespace(
+            clip=replace(capture, poses={t: p for t, p in capture.poses.items() if t != first})
+        )
+
+    first, second, *_ = sorted(clip.poses)
+    monkeypatch.setattr(track_module, "track", without_first)
+    changed = with_tracking(clip, SimpleNamespace(out=str(tmp_path)))
+    assert {*changed.splits["train"]} == {key for key in clip.splits["train"] if key.timestep != first}
+    assert all(changed.splits[task] == clip.splits[task] for task in ("novel_view", "self_reenactment"))
+    assert changed.poses[first].timestep == first
+    assert changed.poses[first].jaw.tolist() == changed.poses[second].jaw.tolist()
+
+
 @pytest.mark.commands
 def test_the_change_reaches_the_rows(patterned_capture, tmp_path):
     conditions = json.dumps([{}, {"name": "tracked", "clip": {"name": "tracked", "parameters": {"seed": 2}}}])
