@@ -97,7 +97,6 @@ class Lpips:
     - ``weights``: file of the backbone, or folder to look in; see the module for the default.
     - ``device``: device of the network, which always computes in float32.
     - ``scaled``: whether to scale images to [-1, 1], as the constants expect; False feeds [0, 1].
-    - ``cache_mb``: maximum memory for cached features of ground-truth images, which the next method reuses, in 10^6 bytes.
     """
 
     def __init__(
@@ -107,12 +106,9 @@ class Lpips:
         weights: Path | None = None,
         device: str = "cpu",
         scaled: bool = True,
-        cache_mb: float = 256.0,
     ) -> None:
         self.spec = NETWORKS[net]
         self.scaled = scaled
-        self._cache: dict[tuple[bytes, tuple[int, ...]], list[Tensor]] = {}
-        self._cache_bytes, self._held = int(cache_mb * 1e6), 0
         backbone = load_backbone(self.spec, find_backbone(self.spec, weights))
         linear = load_linear(self.spec)
         self.device = torch.device(device)
@@ -140,7 +136,7 @@ class Lpips:
         # Both stacks go through the network separately: half the peak memory, the same numbers.
         with torch.inference_mode():
             total = torch.zeros(len(images), dtype=torch.float64, device=self.device)
-            layers = zip(self._features(images), self._target_features(targets), self._linear)
+            layers = zip(self._features(images), self._features(targets), self._linear)
             for features, target_features, weight in layers:
                 difference = features.sub_(target_features).square_()
                 total += functional.conv2d(difference, weight).mean(dim=(1, 2, 3), dtype=torch.float64)
@@ -152,25 +148,6 @@ class Lpips:
             while batch := list(islice(alike, size)):
                 images, targets = zip(*batch)
                 yield from map(float, self.distances(np.stack(images), np.stack(targets)))
-
-    def _target_features(self, targets: ByteArray) -> list[Tensor]:
-        """As `_features`, cached per frame, since every method is compared with the same ground truth."""
-        places = [
-            (hashlib.blake2b(np.ascontiguousarray(target), digest_size=16).digest(), target.shape)
-            for target in targets
-        ]
-        if all(place in self._cache for place in places):
-            return [torch.cat(layer) for layer in zip(*(self._cache[place] for place in places))]
-        features = self._features(targets)
-        for index, place in enumerate(places):
-            layers = [layer[index : index + 1] for layer in features]
-            size = sum(layer.numel() * layer.element_size() for layer in layers)
-            # Once the cache is full, nothing is replaced: all methods use the same frame order, so that a new entry would be
-            # evicted before its next use.
-            if place not in self._cache and self._held + size <= self._cache_bytes:
-                self._cache[place] = [layer.clone() for layer in layers]
-                self._held += size
-        return features
 
     def _features(self, images: ByteArray) -> list[Tensor]:
         """Unit-length features of each tapped layer, (N, C, h, w)."""
