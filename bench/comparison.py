@@ -11,13 +11,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import tyro
 
 from .condition import PLAIN
 from .configuration import build, merge, parse_assignments, with_homes
 from .contracts import Progress
+from .engine.captures import PROGRAMS, check_trusted, open_clips, programs, reader_of, run_configuration
 from .engine.config import (
     RunConfig,
     RunOptions,
@@ -29,6 +30,7 @@ from .engine.config import (
     resolve_metrics,
     with_methods,
 )
+from .engine.store import FinishedRun, RunFolder
 from .errors import HeadbenchError, InputError
 from .executors.settings import Execution, ExecutorName, chosen_execution
 from .io.documents import read_yaml
@@ -43,11 +45,8 @@ from .progress import counted, log_to_file
 from .progress import progress as show_progress
 from .protocol import check_capture, needed
 from .registry import discover, get, resolve
+from .rows import Rows
 from .specs import CommandResult, command
-
-if TYPE_CHECKING:
-    from .engine.store import FinishedRun
-    from .rows import Rows
 
 log = logging.getLogger(__name__)
 Preset = Literal["quick", "smoke", "demo", "fast", "paper"]
@@ -273,8 +272,6 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
         if key not in values:
             raise InputError(source, key, f"--{key} or the key {key} in --config", "neither")
     if "reader" not in values and isinstance(values["data"], str):
-        from .engine.captures import reader_of  # slow to import
-
         values["reader"] = reader_of(values["data"])
     execution = chosen_execution(
         values.pop("execution", {}),
@@ -296,8 +293,6 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
             "\n".join(lines), {"cells": [{"cell": name, "state": state} for name, state in cells.items()]}
         )
     if settings.protocol:
-        from .engine.captures import open_clips
-
         for clip in open_clips(config):
             check_capture(settings.protocol, clip)
     from .engine.run import run as run_comparison
@@ -308,8 +303,6 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
 
 def _configuration_of(run: Path, values: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
     """Configuration of a run whose avatars are used."""
-    from .engine.captures import PROGRAMS, check_trusted, programs, run_configuration
-
     used: Any = tuple(group for group in ("methods", "metrics") if group not in values)
     lists = [value.split(",") if isinstance(value, str) else value for value in values.values()]
     given = {name for names in lists if isinstance(names, (list, tuple)) for name in names}
@@ -329,8 +322,6 @@ def _result(run: FinishedRun) -> CommandResult:
 
 def closing(run: Path, rows: Rows) -> str:
     """Three lines at the end of a run: path of the report, its content, and suggested commands."""
-    from .engine.store import RunFolder  # imports pandas
-
     folder, page = shlex.quote(str(run)), RunFolder(run).page
     first = f"Report: {page} (for a browser; it needs no network)"
     if not page.is_file():

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import tyro
 
 from . import terminal
+from .configuration import parse_assignments
 from .contracts import Progress
+from .engine.config import RunConfig, resolve_method
 from .errors import ExitCode, HeadbenchError, InputError, install_extra
 from .io.files import check_writable, write_json
-from .registry import get, resolve
+from .machine import check_device, machine_record
+from .registry import discover, get, resolve, unknown
 from .specs import CommandResult, MethodSpec, Need, command
 
 Key = TypeVar("Key", bound=Hashable)
@@ -161,11 +166,6 @@ class PluginStatus(NamedTuple):
 @command("doctor", group="validate")
 def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
     """Report what methods, metrics and readers lack here, and how to install it."""
-    from .configuration import parse_assignments
-    from .engine.config import RunConfig
-    from .errors import InputError
-    from .machine import machine_record
-    from .registry import discover, get, unknown
 
     assigned = parse_assignments(settings.set)
     stray = set(assigned) - {"settings"}
@@ -227,7 +227,6 @@ def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
 
 
 def _device(device: str) -> Iterator[Need]:
-    from .machine import check_device
 
     try:
         check_device(device)
@@ -239,15 +238,12 @@ def _device(device: str) -> Iterator[Need]:
 
 def _programs() -> dict[str, str]:
     """Functions that yield the needs of the programs that commands run, by name of the program."""
-    from .registry import discover
 
     specs = [plugin.spec for plugin in discover("commands").values()]
     return {name: needs for spec in specs if spec is not None for name, needs in spec.programs.items()}  # type: ignore[attr-defined]
 
 
 def _slurm() -> Iterator[Need]:
-    import shutil
-    from importlib.metadata import PackageNotFoundError, version
 
     try:
         installed = version("submitit")
@@ -261,8 +257,6 @@ def _slurm() -> Iterator[Need]:
 def _method(
     name: str, named: bool, all_defaults: bool, device: str, chosen: Mapping[str, Mapping[str, Any]]
 ) -> PluginStatus:
-    from .engine.config import resolve_method
-    from .registry import discover, get, resolve
 
     plugin = discover("methods").get(name)
     if plugin is not None and plugin.spec is None:
@@ -288,8 +282,6 @@ def _asked(needs: str, config: Any, device: str, given: bool = False) -> Iterato
     """The requirements that a plug-in declares; an exception is reported as a missing
     requirement.
     """
-    from .errors import InputError
-    from .registry import resolve
 
     try:
         yield from resolve(needs)(config, device)
