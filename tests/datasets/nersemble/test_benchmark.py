@@ -138,7 +138,6 @@ def track(monkeypatch):
         totals={"393": 2 * FRAMES},
     )
     monkeypatch.setattr(submission, "TRACKS", {MONO.name: small})
-    monkeypatch.setattr("headbench.datasets.nersemble.benchmark.submission.TRACKS", {MONO.name: small})
     return small
 
 

@@ -13,7 +13,7 @@ from headbench.bench.errors import HeadbenchError, InputError
 from headbench.bench.executors.settings import Execution
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.synthetic.capture import synthesize
-from headbench.datasets.synthetic.plan import EDITION, FRONTAL
+from headbench.datasets.synthetic.plan import EDITION, FRONTAL, RESIDUALS
 
 from .conftest import SMALL
 
@@ -163,19 +163,34 @@ def content(path):
     return path.read_bytes()
 
 
-def test_a_small_capture_has_the_same_bytes_on_every_machine(capture):
-    """A change of what captures show is a new `EDITION`, with new digests here. XMP states headbench's version."""
-    out, found = capture[0], {}
-    assert "digitalsourcetype/algorithmicMedia<" in (out / "provenance.xmp").read_text()
-    for path in sorted(path for path in out.rglob("*.*") if path.suffix != ".xmp"):
-        kind = found.setdefault(path.suffix, hashlib.sha256())
-        kind.update(path.relative_to(out).as_posix().encode() + content(path))
-    assert {kind: digest.hexdigest()[:16] for kind, digest in found.items()} == {
+DIGESTS = {
+    "plain": {
         ".json": "1b6a132015d7d892",
         ".npz": "99342d2810fb4ff3",
         ".png": "0fdbd8b5db20d443",
         ".txt": "786fab0254f7d5ea",
-    }
+    },
+    "with residuals": {
+        ".json": "5c71f03630ca8cec",
+        ".npz": "519ff796fa7fdbe3",
+        ".png": "73606a35a76d44ac",
+        ".txt": "786fab0254f7d5ea",
+    },
+}
+
+
+@pytest.mark.parametrize("pictures", DIGESTS)
+def test_a_small_capture_has_the_same_bytes_on_every_machine(capture, tmp_path, pictures):
+    """A change of what captures show is a new `EDITION`, with new digests here. XMP states headbench's version."""
+    out, found = capture[0], {}
+    if pictures == "with residuals":
+        out = tmp_path / "capture"
+        synthesize(out, **SMALL, **dict.fromkeys(RESIDUALS, 2.0), tracking_error=1.0)
+    assert "digitalsourcetype/algorithmicMedia<" in (out / "provenance.xmp").read_text()
+    for path in sorted(path for path in out.rglob("*.*") if path.suffix != ".xmp"):
+        kind = found.setdefault(path.suffix, hashlib.sha256())
+        kind.update(path.relative_to(out).as_posix().encode() + content(path))
+    assert {kind: digest.hexdigest()[:16] for kind, digest in found.items()} == DIGESTS[pictures]
 
 
 _NUMPY = [name for name in np.show_config(mode="dicts")["SIMD Extensions"].get("found", []) if name]

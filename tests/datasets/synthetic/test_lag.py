@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from headbench.datasets.synthetic.hair import STYLES
 from headbench.datasets.synthetic.history import (
-    FOLLOWED,
     HAIR_DAMPING,
     NECK_DAMPING,
     NECK_FREQUENCY,
@@ -14,7 +12,7 @@ from headbench.datasets.synthetic.history import (
     hair_frequency,
 )
 from headbench.datasets.synthetic.performance import CONTROLS, Performed
-from headbench.datasets.synthetic.subject import LatePoses, swing
+from headbench.datasets.synthetic.subject import LatePoses
 
 from .conftest import settled
 
@@ -62,12 +60,6 @@ def test_a_still_head_is_not_left(rest):
         assert late == {**rest, "head_turn": 0.125, "jaw_open": 0.2}
 
 
-def test_long_hair_swings_as_slowly_as_a_rod_of_its_length():
-    """The period of a thin rod about its end, by the integral of small swings of two thirds of its length."""
-    assert 1.0 / hair_frequency(0.3) == pytest.approx(2.0 * np.pi * np.sqrt(0.2 / 9.81))
-    assert hair_frequency(STYLES["long"].length) < 2.0 < hair_frequency(STYLES["short"].length)
-
-
 def test_hair_and_neck_move_and_nothing_else(plan, subject, rest):
     pose = plan.geometry.translation.pose
     state = settled(rest, plan.person)
@@ -88,11 +80,3 @@ def test_hair_and_neck_move_and_nothing_else(plan, subject, rest):
     assert 1e-4 < moved["skin"].max() < 0.3 * 0.1 * 0.2  # 0.3 of a turn of 0.1 within 20 cm
     for name in moved.keys() - {"hair", "skin", "beard"}:
         assert moved[name].max() == 0.0, name
-
-
-def test_hair_swings_at_its_tips_and_not_at_its_roots(subject):
-    share, strands = swing(subject._hair)[:, 0], subject._hair
-    first, last = np.unique(strands.strand, return_index=True)[1], np.flatnonzero(np.diff(strands.strand))
-    assert share[first].max() == 0.0
-    assert (share[last] > share[first[:-1]]).all()
-    assert set(FOLLOWED) < set(CONTROLS)

@@ -9,18 +9,14 @@ import pytest
 from headbench.datasets.synthetic.performance import CONTROLS, Performed
 from headbench.datasets.synthetic.plan import FRONTAL
 from headbench.datasets.synthetic.renderer import (
-    APART_PIXELS,
     BALANCE,
     EXPOSURE,
     GAMMA,
     MATTE_METRES,
-    MOST,
-    develop,
     draw_response,
     exposed,
     matte,
     outline,
-    sub_frames,
 )
 
 METRE = 1000.0  # pixels of a metre
@@ -86,16 +82,6 @@ def test_a_camera_changes_each_pixel_by_one_curve_per_channel(plan, recorded):
     assert np.ptp(shifts, axis=0).min() > 0.02  # cameras differ
 
 
-def test_what_is_still_is_exposed_in_one_moment():
-    assert sub_frames(0.0, 500.0, 1.0, 0.003).tolist() == [0.0]
-    assert sub_frames(APART_PIXELS / 500.0 * 0.99, 500.0, 1.0, 0.003).tolist() == [0.0]
-    three = sub_frames(APART_PIXELS / 500.0 * 2.5, 500.0, 1.0, 0.003)
-    np.testing.assert_allclose(three, [-0.001, 0.0, 0.001])
-    assert len(sub_frames(1.0, 500.0, 1.0, 0.003)) == MOST
-    frame = np.ones((2, 2, 3)), np.ones((2, 2))
-    assert exposed([frame]) is frame
-
-
 def test_an_exposure_adds_light_where_it_is_covered():
     """A pixel that red covers half of the time, and one that red and blue cover in turn."""
     red, blue = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.5])
@@ -150,18 +136,6 @@ def test_a_matte_displaces_the_outline_of_hair(level):
     assert (found - alpha).min() < -0.3 * min(level, 1.0)
 
 
-def test_a_matte_keeps_what_is_not_hair_and_no_single_hair():
-    alpha, _ = disc(40.0)
-    left = np.zeros(alpha.shape)
-    left[:, :60] = 1.0
-    found = matte(alpha, left, 1.0, METRE, 3)
-    np.testing.assert_array_equal(found[:, 60:], alpha[:, 60:])
-    np.testing.assert_array_equal(matte(np.zeros((9, 9)), np.ones((9, 9)), 1.0, METRE, 3), np.zeros((9, 9)))
-    alpha, _ = disc(30.0)
-    alpha[60, 95:110] = 1.0  # a hair as thick as a pixel, a quarter of what a matte keeps, is lost
-    assert matte(alpha, np.ones(alpha.shape), 1.0, METRE, 3)[60, 98:108].max() < 0.5
-
-
 def test_masks_err_at_hair_and_not_along_the_skin(plan, recorded):
     erring = recorded(mask_error=1.0)
     (before, mask), (after, found) = recorded().render(FRONTAL, 5), erring.render(FRONTAL, 5)
@@ -179,25 +153,3 @@ def test_masks_err_at_hair_and_not_along_the_skin(plan, recorded):
     edge = (mask > 0) & (mask < 255)
     assert (edge & bare & ~locks).sum() > 5
     assert not (changed & bare & ~locks).any()
-
-
-def test_a_matte_too_wide_shows_the_room_behind():
-    rgb, white = np.full((1, 3, 3), 0.2), np.ones(3)
-    alpha, found = np.array([[0.0, 1.0, 0.5]]), np.array([[1.0, 0.0, 0.5]])
-    picture, mask = develop(rgb, alpha, white, found)
-    exact, _ = develop(rgb, alpha, white)
-    assert picture[0, 0].tolist() == [128] * 3
-    assert picture[0, 1].tolist() == [255] * 3
-    np.testing.assert_array_equal(picture[0, 2], exact[0, 2])
-    assert mask.tolist() == [[255, 0, 128]]
-
-
-def test_a_triangle_covers_the_pixels_within_it(plan):
-    view = plan.cameras[FRONTAL]
-    corners = np.array([[10.5, 10.5], [30.5, 10.5], [10.5, 30.5]])
-    rays = np.concatenate([corners, np.ones((3, 1))], axis=1) @ np.linalg.inv(view.K).T
-    world = (rays - view.world_to_camera[:3, 3]) @ view.world_to_camera[:3, :3]
-    covered = outline(view, world, np.array([[0, 1, 2]]))
-    rows, columns = np.indices(covered.shape)
-    inside = (rows >= 10) & (columns >= 10) & (rows + columns <= 40)
-    assert (covered != inside).sum() <= 2

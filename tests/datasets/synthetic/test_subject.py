@@ -11,19 +11,6 @@ from headbench.datasets.synthetic.skin import flush_strengths, make_folds
 from .conftest import settled
 
 
-def test_tracked_vertices_lie_on_the_skin_that_is_rendered(plan, subject, rest):
-    """With hair and folds taken off, the rendered skin passes through every tracked skin vertex."""
-    pose = plan.geometry.translation.pose(
-        {**rest, "jaw_open": 0.6, "smile_left": 0.5, "head_turn": 0.2}, "900", 0
-    )
-    tracked = subject.tracked(pose)
-    fine = subject._fine
-    corners = fine.weights.max(1) == 1.0
-    own = np.take_along_axis(fine.parents, fine.weights.argmax(1)[:, None], 1)[:, 0]
-    np.testing.assert_allclose(fine.positions(tracked)[corners], tracked[own[corners]], atol=1e-12)
-    assert set(own[corners]) == set(np.unique(subject.anatomy.skin_faces))
-
-
 def test_eyeballs_follow_the_tracked_ones(plan, subject, rest):
     pose = plan.geometry.translation.pose(
         {**rest, "gaze_left": 1.0, "head_nod": 0.2, "sway_x": 0.01}, "900", 0
