@@ -11,7 +11,7 @@ static_assert(kGroupRows % kSplatGroup == 0 && kGroupRows % W == 0 && kNetworkTi
 
 HEADBENCH_INLINE std::int64_t whole_groups(std::int64_t rows) { return (rows + kGroupRows - 1) / kGroupRows * kGroupRows; }
 
-constexpr int kOuterVectors = W == 16 ? 6 : 2;  // of the colours' inputs, with kSparseGroup rows
+constexpr int kOuterVectors = W == 16 ? 6 : 3;  // of the colours' inputs, with kSparseGroup rows
 
 // sums[unit][column] += sum over a group's rows of left[row][unit] right[row][column], for the listed units.
 template <int rows, int vectors>
@@ -38,7 +38,7 @@ template <int rows, int most_vectors>
 inline void outer_product(const float* left, int left_stride, const Lists<rows>& lists, int groups, const float* right,
                           int right_stride, int width, float* sums) {
   for (int column = 0; column < width;) {
-    const int vectors = width - column >= most_vectors * W ? most_vectors : width - column >= 2 * W ? 2 : 1;
+    const int vectors = vectors_at_once(width - column, most_vectors);
     for (int group = 0; group < groups; ++group) {
       const float *values = left + group * rows * left_stride, *some = right + group * rows * right_stride + column;
       const std::int32_t* list = lists.inputs + group * lists.stride;
@@ -287,7 +287,7 @@ inline void color_forward(const ColorTraining& net, std::int64_t begin, std::int
   std::int32_t* list = reinterpret_cast<std::int32_t*>(inputs + kNetworkTile * net.inputs_stride);
   const int used_inputs = net.features + kEncoding;
   for (int k = 0; k < used_inputs; ++k) list[k] = k;
-  Lists<kSplatGroup> lists = {list, 0, {}};
+  Lists<kDenseGroup> lists = {list, 0, {}};
   for (int& count : lists.counts) count = used_inputs;
   find_places(net, begin, end);
   for (std::int64_t first = begin; first < end; first += kNetworkTile) {
@@ -295,7 +295,7 @@ inline void color_forward(const ColorTraining& net, std::int64_t begin, std::int
     const int rows = static_cast<int>(whole_groups(used));
     color_inputs(net, first, used, rows, end, inputs);
     float* hidden = net.kept_hidden + first * net.units;
-    product<kSplatGroup, kSplatVectors>(inputs, net.inputs_stride, lists, rows / kSplatGroup, net.first,
+    product<kDenseGroup, kDenseVectors>(inputs, net.inputs_stride, lists, rows / kDenseGroup, net.first,
                                         net.units_stride, net.units, nullptr, true, hidden, net.units);
     for (int group = 0; group < used; group += kSplatGroup)
       for (int channel = 0; channel < 3; ++channel) {
