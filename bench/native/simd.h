@@ -34,7 +34,10 @@ HEADBENCH_INLINE int highest_bit(std::uint64_t bits) { return 63 - __builtin_clz
 // Write the numbers of the lanes that are set, counted from `first`, to a list with room for all lanes; how many they are.
 HEADBENCH_INLINE int list_lanes(Mask set, int first, std::int32_t* list) {
   int count = 0;
-  for (std::uint32_t lanes = bits(set); lanes; lanes &= lanes - 1) list[count++] = first + lowest_bit(lanes);
+  for (int lane = 0; lane < W; ++lane) {
+    list[count] = first + lane;
+    count += bits(set) >> lane & 1;
+  }
   return count;
 }
 #endif

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -148,7 +150,7 @@ def train(
     timed_from = iteration, seconds()
     limit = 0.0 if budget.iterations else budget.seconds or 0.0
     moments = [moment for part in ESTIMATED_AGAIN if (moment := part * limit) > timed_from[1]]
-    with torch_on_one_thread(compiled):
+    with torch_on_one_thread(compiled), _collecting_new_objects():
         while iteration < total:
             if budget.seconds is not None:
                 now = seconds()
@@ -189,6 +191,16 @@ def train(
     if iteration == 1 and limit:
         log.warning("the limit of %g s left no time for a step: the avatar is as it was at the start", limit)
     return TrainingSummary(iteration, total, seconds(), losses)
+
+
+@contextmanager
+def _collecting_new_objects() -> Iterator[None]:
+    """Exempt all existing objects from garbage collection, which would traverse the imported modules every few iterations."""
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def synchroniser(device: str) -> Callable[[], None]:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.functional import linear
+from torch.optim.adam import adam
 
 from ...bench.contracts import ByteArray, HeadAsset
 from ...bench.native.dispatch import to_device
@@ -96,26 +96,6 @@ def picture_ssim(picture: ByteArray, truth: ByteArray) -> float:
     return float(mean_ssim(*(image.contiguous() for image in planes)))
 
 
-def mean_over_visible(values: Tensor, visible: Tensor) -> Tensor:
-    """Mean of (N,) values where (N,) ``visible`` is true; 0 if there are none."""
-    weight = visible.to(values.dtype)
-    return (values * weight).sum() / weight.sum().clamp_min(1)
-
-
-def position_penalty(means: Tensor, visible: Tensor, threshold: float) -> Tensor:
-    """Mean over visible splats of the excess of (N, 3) local positions over the threshold (triangle sizes)."""
-    return mean_over_visible(F.relu(torch.linalg.vector_norm(means, dim=1) - threshold), visible)
-
-
-def scale_penalty(log_scales: Tensor, visible: Tensor, threshold: float) -> Tensor:
-    """Mean over visible splats of the norm of (N, 3) local scales' excess over the threshold.
-
-    The norm's gradient at zero is taken as 0.
-    """
-    excess = F.relu(log_scales.exp() - threshold)
-    return mean_over_visible(torch.linalg.vector_norm(excess, dim=1), visible)
-
-
 EPS = 1e-15
 
 
@@ -151,29 +131,64 @@ class Optimiser:
         betas: tuple[float, float] = (0.9, 0.999),
         epsilons: Mapping[str, float] = {},
     ):
-        groups = [
-            {"params": [p], "lr": learning_rates[name], "eps": epsilons.get(name, EPS), "name": name}
-            for name, p in parameters.items()
-        ]
-        self._adam = torch.optim.Adam(groups, betas=betas, fused=True)
-        self._groups: dict[str, dict[str, Any]] = {g["name"]: g for g in self._adam.param_groups}
+        self._parameters = dict(parameters)
+        self._rates = {name: learning_rates[name] for name in parameters}
+        self._betas, self._epsilons = betas, epsilons
+        self._moments: dict[str, dict[str, Tensor]] = {}
 
     def __getitem__(self, name: str) -> nn.Parameter:
         """The current parameter of a group."""
-        return self._groups[name]["params"][0]
+        return self._parameters[name]
 
     def set_learning_rate(self, name: str, value: float) -> None:
         """Change the learning rate of one group."""
-        self._groups[name]["lr"] = value
+        self._rates[name] = value
 
     def zero_grad(self) -> None:
         """Drop all gradients."""
-        for group in self._groups.values():
-            group["params"][0].grad = None
+        for parameter in self._parameters.values():
+            parameter.grad = None
 
+    @torch.no_grad()
     def step(self) -> None:
-        """Update every parameter that has a gradient; Kingma and Ba 2015, algorithm 1."""
-        self._adam.step()
+        """Update every parameter that has a gradient; Kingma and Ba 2015, algorithm 1.
+
+        `torch.optim.Adam` does the same in one call for each group, with a third of a millisecond for its bookkeeping.
+        """
+        together: dict[tuple[float, float], list[str]] = {}
+        for name, parameter in self._parameters.items():
+            if parameter.grad is not None:
+                together.setdefault((self._rates[name], self._epsilons.get(name, EPS)), []).append(name)
+        first, second = self._betas
+        for (rate, epsilon), names in together.items():
+            parameters: list[Any] = [self._parameters[name] for name in names]
+            columns = zip(*(self._state(name).values() for name in names))
+            averages, squares, steps = (list(column) for column in columns)
+            gradients = [parameter.grad for parameter in parameters]
+            adam(
+                parameters,
+                gradients,
+                averages,
+                squares,
+                [],
+                steps,
+                beta1=first,
+                beta2=second,
+                lr=rate,
+                eps=epsilon,
+                weight_decay=0.0,
+                amsgrad=False,
+                maximize=False,
+                fused=True,
+            )
+
+    def _state(self, name: str) -> dict[str, Tensor]:
+        """Moments of a group, zero before its first step."""
+        if name not in self._moments:
+            parameter = self._parameters[name]
+            zeros = {moment: torch.zeros_like(parameter) for moment in ("exp_avg", "exp_avg_sq")}
+            self._moments[name] = {**zeros, "step": torch.zeros((), device=parameter.device)}
+        return self._moments[name]
 
     def select(self, names: Iterable[str], keep: Tensor) -> None:
         """Keep only the rows where the (N,) mask is true, in parameters and moments."""
@@ -195,42 +210,34 @@ class Optimiser:
         self._replace(name, lambda _: values, torch.zeros_like)
 
     def _replace(self, name: str, change: Any, change_moment: Any = None) -> None:
-        group = self._groups[name]
-        old = group["params"][0]
-        new = nn.Parameter(change(old.detach()).clone())
-        state = self._adam.state.pop(old, None)
-        if state:
-            for moment in ("exp_avg", "exp_avg_sq"):
-                state[moment] = (change_moment or change)(state[moment]).clone()
-            self._adam.state[new] = state
-        group["params"][0] = new
+        self._parameters[name] = nn.Parameter(change(self[name].detach()).clone())
+        state = self._moments.get(name, {})
+        for moment in state.keys() - {"step"}:
+            state[moment] = (change_moment or change)(state[moment]).clone()
 
     def moments(self, name: str) -> dict[str, Tensor]:
         """Adam state of a group: exp_avg, exp_avg_sq, step; empty before its first step."""
-        return dict(self._adam.state.get(self[name], {}))
+        return dict(self._moments.get(name, {}))
 
     def state(self) -> dict[str, Any]:
         """Parameters, moments and learning rates as tensors and plain containers."""
         return {
-            name: {
-                "value": group["params"][0].detach(),
-                "lr": float(group["lr"]),
-                "moments": self.moments(name),
-            }
-            for name, group in self._groups.items()
+            name: {"value": parameter.detach(), "lr": float(self._rates[name]), "moments": self.moments(name)}
+            for name, parameter in self._parameters.items()
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore what `state` returned; tensors may have any number of rows."""
-        for name, group in self._groups.items():
+        for name, old in self._parameters.items():
             entry = state[name]
-            old = group["params"][0]
-            self._adam.state.pop(old, None)
-            new = nn.Parameter(entry["value"].to(old.device, old.dtype))
-            group["params"][0] = new
-            group["lr"] = entry["lr"]
+            self._parameters[name] = nn.Parameter(entry["value"].to(old.device, old.dtype))
+            self._rates[name] = entry["lr"]
+            self._moments.pop(name, None)
             if entry["moments"]:
-                self._adam.state[new] = {k: v.to(old.device) for k, v in entry["moments"].items()}
+                moments = {
+                    key: entry["moments"][key].to(old.device) for key in ("exp_avg", "exp_avg_sq", "step")
+                }
+                self._moments[name] = moments
 
 
 CHILDREN = 2

@@ -5,24 +5,112 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from ...bench.contracts import BoolArray, Camera, Clip, FloatArray, HeadAsset, HeadPose, IntArray
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member
+from ...bench.native.dispatch import on_host
 from ...datasets.head.arrays import check_size
 from ...datasets.head.geometry import project, triangle_areas
 from ...datasets.head.model import HeadModel
+from ...datasets.head.rotations import matrices_and_derivatives
 from ..ops.splats import TriangleFrames, triangle_frames
 from .schedule import numpy_generator
 from .tensor_files import MAX_MAGNITUDE, check_tensors
 
 Value = TypeVar("Value")
+
+
+DRIVING = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids")
+
+
+class _Rig(NamedTuple):
+    """A head model with one identity: (3 V,) neutral mesh, (J, 3) its joints, (J, V) skinning weights."""
+
+    model: HeadModel
+    neutral: Tensor
+    joints: FloatArray
+    weights: Tensor
+
+
+class _PosedMesh(torch.autograd.Function):
+    """`HeadModel.forward` of one timestep in host memory, in a few passes over the vertices.
+
+    Rotations and joints are computed by numpy in float64: torch's functions take longer for a few numbers than for the mesh.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, rig: _Rig, *values: Tensor | None) -> Tensor:
+        *values, lids = values
+        model = rig.model
+        expression, *angles, translation = (value.detach()[0] for value in values)
+        rotations, ctx.derivatives = matrices_and_derivatives(
+            torch.cat(angles).double().numpy().reshape(-1, 3)
+        )
+        joints = rig.joints + (expression @ model.joint_matrix).numpy().reshape(-1, 3).astype(np.float64)
+        turns, shifts = [rotations[0]], [joints[0] - rotations[0] @ joints[0]]
+        for joint, parent in enumerate(model.parents[1:], start=1):
+            turns.append(turns[parent] @ rotations[joint])
+            shifts.append(shifts[parent] + (turns[parent] - turns[joint]) @ joints[joint])
+        motions = np.concatenate([np.array(turns), np.array(shifts)[:, :, None]], axis=2)
+        feature = torch.from_numpy((rotations[1:] - np.eye(3)).ravel()).to(expression)
+        shaped = torch.addmv(rig.neutral, model.expression_matrix.t(), expression)
+        shaped = torch.addmv(shaped, model.pose_matrix.t(), feature).view(-1, 3).t().contiguous()
+        blended = torch.from_numpy(motions.reshape(-1, 12).T).to(shaped) @ rig.weights
+        blended = blended.view(3, 4, -1)
+        vertices = blended[:, 3] + translation[:, None]
+        for axis in range(3):
+            vertices.addcmul_(blended[:, axis], shaped[axis])
+        raised = None
+        if lids is not None and model.eyelid_matrix is not None:
+            raised = (lids.detach()[0] @ model.eyelid_matrix).view(-1, 3).t()
+            vertices.addmm_(torch.from_numpy(turns[1]).to(shaped), raised)
+        ctx.rig, ctx.small = rig, (rotations, joints, turns)
+        ctx.save_for_backward(shaped, blended, raised)
+        return vertices.t().contiguous()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_vertices: Tensor) -> tuple[Tensor | None, ...]:
+        shaped, blended, raised = ctx.saved_tensors
+        model, weights = ctx.rig.model, ctx.rig.weights
+        rotations, joints, turns = ctx.small
+        gradient = by_vertices.t().contiguous()
+        by_shaped = blended[0, :3] * gradient[0]
+        for row in (1, 2):
+            by_shaped.addcmul_(blended[row, :3], gradient[row])
+        by_blended = torch.cat([gradient[:, None] * shaped, gradient[:, None]], dim=1)
+        by_motions = (by_blended.view(12, -1) @ weights.t()).t().double().numpy().reshape(-1, 3, 4)
+        by_turns, by_shifts = by_motions[:, :, :3].copy(), by_motions[:, :, 3].copy()
+        by_flat = by_shaped.t().reshape(-1)
+        by_rotations, by_joints = np.zeros_like(rotations), np.zeros_like(joints)
+        by_rotations[1:] = (model.pose_matrix @ by_flat).double().numpy().reshape(-1, 3, 3)
+        by_lids = None
+        if raised is not None:
+            by_turns[1] += (gradient @ raised.t()).double().numpy()
+            lifted = torch.from_numpy(turns[1].T).to(shaped) @ gradient
+            by_lids = (model.eyelid_matrix @ lifted.t().reshape(-1))[None]
+        for joint, parent in reversed([*enumerate(model.parents)][1:]):
+            bend = np.outer(by_shifts[joint], joints[joint])
+            by_joints[joint] = (turns[parent] - turns[joint]).T @ by_shifts[joint]
+            by_shifts[parent] += by_shifts[joint]
+            by_turns[joint] -= bend
+            by_turns[parent] += bend + by_turns[joint] @ rotations[joint].T
+            by_rotations[joint] += turns[parent].T @ by_turns[joint]
+        by_joints[0] = by_shifts[0] - rotations[0].T @ by_shifts[0]
+        by_rotations[0] = by_turns[0] - np.outer(by_shifts[0], joints[0])
+        by_angles = np.einsum("jrck,jrc->jk", ctx.derivatives, by_rotations).ravel()
+        of_joints, of_angles = (torch.from_numpy(each).to(shaped) for each in (by_joints.ravel(), by_angles))
+        by_expression = torch.addmv(model.expression_matrix @ by_flat, model.joint_matrix, of_joints)
+        parts = by_expression, *of_angles.split([3, 3, 3, 6]), gradient.sum(1)
+        return None, *(part[None] for part in parts), by_lids
 
 
 class SubjectMesh:
@@ -39,8 +127,12 @@ class SubjectMesh:
         # Copies: a clip's arrays are read-only and shared by all methods.
         identity, offset = (torch.tensor(np.asarray(each)).to(like) for each in (shape, static_offset))
         self._canonical = self.model.canonical(identity, offset)
-        still = self._canonical.new_zeros(1, self.model.expression_size)
-        self._joints = self.model.rest_joints(self._canonical, still)[0].cpu().double().numpy()
+        self._rig = _Rig(
+            self.model,
+            self.canonical.reshape(-1),
+            (self.model.joint_regressor @ self.canonical).numpy(force=True),
+            self.model.skinning_weights.t().contiguous(),
+        )
         check_size(
             "subject", "shape, static_offset", self._canonical[0].cpu().numpy(), np.asarray(head.faces)
         )
@@ -61,6 +153,9 @@ class SubjectMesh:
 
     def posed(self, arguments: Mapping[str, Tensor]) -> Tensor:
         """(V, 3) vertices in the world for one timestep's arguments; differentiable in them."""
+        if on_host(self._canonical):
+            values = (arguments.get(name) for name in DRIVING)
+            return _PosedMesh.apply(self._rig, *values)  # type: ignore[no-untyped-call, no-any-return]
         return self.model(canonical=self._canonical, **arguments)[0]
 
     def unposed(self, arguments: Mapping[str, Tensor]) -> Tensor:
@@ -75,7 +170,7 @@ class SubjectMesh:
     @torch.no_grad()
     def drive(self, pose: HeadPose) -> TriangleFrames:
         """Triangle frames of a pose in the world."""
-        return self.frames(self.model.driven(self.canonical, self._joints, pose))
+        return self.frames(self.model.driven(self.canonical, self._rig.joints, pose))
 
 
 class TrainingPoses:
@@ -118,9 +213,6 @@ class BoundedCache(Generic[Value]):
 
     def __len__(self) -> int:
         return len(self._values)
-
-
-DRIVING = ("expression", "rotation", "neck", "jaw", "eyes", "translation", "eyelids")
 
 
 def pose_key(pose: HeadPose) -> bytes:

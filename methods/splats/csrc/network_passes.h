@@ -11,7 +11,7 @@ static_assert(kGroupRows % kSplatGroup == 0 && kGroupRows % W == 0 && kNetworkTi
 
 HEADBENCH_INLINE std::int64_t whole_groups(std::int64_t rows) { return (rows + kGroupRows - 1) / kGroupRows * kGroupRows; }
 
-constexpr int kOuterVectors = W == 16 ? 6 : 2;  // of the colours' inputs, with kSparseGroup rows
+constexpr int kOuterVectors = W == 16 ? 6 : 3;  // of the colours' inputs, with kSparseGroup rows
 
 // sums[unit][column] += sum over a group's rows of left[row][unit] right[row][column], for the listed units.
 template <int rows, int vectors>
@@ -38,7 +38,7 @@ template <int rows, int most_vectors>
 inline void outer_product(const float* left, int left_stride, const Lists<rows>& lists, int groups, const float* right,
                           int right_stride, int width, float* sums) {
   for (int column = 0; column < width;) {
-    const int vectors = width - column >= most_vectors * W ? most_vectors : width - column >= 2 * W ? 2 : 1;
+    const int vectors = vectors_at_once(width - column, most_vectors);
     for (int group = 0; group < groups; ++group) {
       const float *values = left + group * rows * left_stride, *some = right + group * rows * right_stride + column;
       const std::int32_t* list = lists.inputs + group * lists.stride;
@@ -287,7 +287,7 @@ inline void color_forward(const ColorTraining& net, std::int64_t begin, std::int
   std::int32_t* list = reinterpret_cast<std::int32_t*>(inputs + kNetworkTile * net.inputs_stride);
   const int used_inputs = net.features + kEncoding;
   for (int k = 0; k < used_inputs; ++k) list[k] = k;
-  Lists<kSplatGroup> lists = {list, 0, {}};
+  Lists<kDenseGroup> lists = {list, 0, {}};
   for (int& count : lists.counts) count = used_inputs;
   find_places(net, begin, end);
   for (std::int64_t first = begin; first < end; first += kNetworkTile) {
@@ -295,7 +295,7 @@ inline void color_forward(const ColorTraining& net, std::int64_t begin, std::int
     const int rows = static_cast<int>(whole_groups(used));
     color_inputs(net, first, used, rows, end, inputs);
     float* hidden = net.kept_hidden + first * net.units;
-    product<kSplatGroup, kSplatVectors>(inputs, net.inputs_stride, lists, rows / kSplatGroup, net.first,
+    product<kDenseGroup, kDenseVectors>(inputs, net.inputs_stride, lists, rows / kDenseGroup, net.first,
                                         net.units_stride, net.units, nullptr, true, hidden, net.units);
     for (int group = 0; group < used; group += kSplatGroup)
       for (int channel = 0; channel < 3; ++channel) {
@@ -356,7 +356,7 @@ HEADBENCH_INLINE void planes_backward(const ColorTraining& net, const Between* a
 }
 
 inline std::size_t color_backward_scratch(const ColorTraining& net) {
-  return static_cast<std::size_t>(kNetworkTile) * (net.units_stride + 2 * net.inputs_stride) +
+  return static_cast<std::size_t>(kNetworkTile) * (net.units_stride + net.inputs_stride) +
          kNetworkTile / kSparseGroup * net.units;
 }
 
@@ -364,8 +364,7 @@ inline void color_backward(const ColorTraining& net, const ColorSums& at, std::i
                            float* scratch) {
   float* by_hidden = scratch;
   float* inputs = by_hidden + kNetworkTile * net.units_stride;
-  float* by_inputs = inputs + kNetworkTile * net.inputs_stride;
-  std::int32_t* list = reinterpret_cast<std::int32_t*>(by_inputs + kNetworkTile * net.inputs_stride);
+  std::int32_t* list = reinterpret_cast<std::int32_t*>(inputs + kNetworkTile * net.inputs_stride);
   for (std::int64_t first = begin; first < end; first += kNetworkTile) {
     const int used = end - first < kNetworkTile ? static_cast<int>(end - first) : kNetworkTile;
     const int groups = (used + kSparseGroup - 1) / kSparseGroup;
@@ -407,19 +406,17 @@ inline void color_backward(const ColorTraining& net, const ColorSums& at, std::i
     }
     outer_product<kSparseGroup, kOuterVectors>(by_hidden, net.units_stride, on, groups, inputs, net.inputs_stride,
                                                net.inputs, sums + at.first);
+    float* by_inputs = net.by_inputs + first * net.inputs;
     if (net.by_positions)
       product<kSparseGroup, kOuterVectors>(by_hidden, net.units_stride, on, groups, net.first, net.inputs_stride,
-                                           net.inputs, nullptr, false, by_inputs, net.inputs_stride);
+                                           net.inputs, nullptr, false, by_inputs, net.inputs);
     else  // features alone
       product<kSparseGroup, kSparseVectors>(by_hidden, net.units_stride, on, groups, net.first, net.inputs_stride,
                                             (net.features + kUnitsStep - 1) / kUnitsStep * kUnitsStep, nullptr, false,
-                                            by_inputs, net.inputs_stride);
-    for (int s = 0; s < used; ++s) {
+                                            by_inputs, net.inputs);
+    for (int s = 0; s < used && net.by_positions; ++s) {
       const std::int64_t splat = first + s;
-      const float* gradient = by_inputs + s * net.inputs_stride;
-      float* kept = net.by_features + splat * net.features;
-      for (int k = 0; k < net.features; ++k) kept[k] = gradient[k];
-      if (!net.by_positions) continue;
+      const float* gradient = by_inputs + s * net.inputs;
       Between at_samples[3];
       for (int axis = 0; axis < 3; ++axis) at_samples[axis] = between(net, splat, axis);
       planes_backward(net, at_samples, gradient, net.by_positions + 3 * splat);
@@ -434,14 +431,14 @@ inline void scatter_plane(const ColorTraining& net, int plane, int row, const st
   const int across = kPlaneAxes[plane][0], down = kPlaneAxes[plane][1], channels = net.channels[plane];
   int skipped = 0;
   for (int k = 0; k < plane; ++k) skipped += net.channels[k];
-  const float* features = net.by_features + skipped;
+  const float* features = net.by_inputs + skipped;
   constexpr std::int64_t ahead = 8;
   for (std::int64_t i = 0; i < count; ++i) {
     if (i + ahead < count) {
-      const float* later = features + static_cast<std::size_t>(order[i + ahead]) * net.features;
+      const float* later = features + static_cast<std::size_t>(order[i + ahead]) * net.inputs;
       for (int k = 0; k < channels; k += 16) HEADBENCH_PREFETCH(later + k);
     }
-    const float* gradient = features + static_cast<std::size_t>(order[i]) * net.features;
+    const float* gradient = features + static_cast<std::size_t>(order[i]) * net.inputs;
     const Between x = between(net, order[i], across), y = between(net, order[i], down);
     for (int side = 0; side < 2; ++side) {
       if (row + side < first || row + side > last) continue;

@@ -154,10 +154,10 @@ class ColorPass {
     net.lower = lower_.data();
     net.fractions = fractions_.data();
     Buffer<float> first, last, sums;
-    const Buffer<float> by_features(net.count * net.features);
+    const Buffer<float> by_inputs(rounded_up(net.count, kGroupRows) * net.inputs);
     net.first = pad(first, in.first, in.hidden, in.inputs, net.units, net.inputs_stride).data();
     net.last = pad(last, in.last, 3, in.hidden, 3, net.units).data();
-    net.by_features = by_features.data();
+    net.by_inputs = by_inputs.data();
     const std::size_t of_first = static_cast<std::size_t>(net.units) * net.inputs;
     const ColorSums at{0, of_first, of_first + std::size_t{3} * net.units};
     const nb::gil_scoped_release unlocked;

@@ -61,7 +61,7 @@ struct ColorTraining {
   const float* first;
   // Backward.
   const float* by_colors;  // (N, 3)
-  float* by_features;      // (N, features)
+  float* by_inputs;        // (N padded, inputs)
   float* by_positions;     // (N, 3), or null if no gradients by positions and directions are needed
   float* by_directions;    // (N, 3), or null with it
   float* by_planes[kPlanes];

@@ -9,8 +9,9 @@ static_assert(kUnitsStep % W == 0);
 
 // Rows that go through a layer together, and with them the vectors of outputs that registers hold. Few rows, where units that
 // are off are left out: each then shares its inputs with fewer others. Two are best forward, four backward.
-constexpr int kSplatGroup = 8, kSplatVectors = W == 16 ? 3 : 1;
-constexpr int kSparseGroup = 4, kSparseVectors = W == 16 ? 4 : 2;
+constexpr int kSplatGroup = 8;
+constexpr int kDenseGroup = W == 16 ? 8 : 4, kDenseVectors = 3;
+constexpr int kSparseGroup = 4, kSparseVectors = W == 16 ? 4 : 3;
 constexpr int kPairGroup = 2, kPairVectors = W == 16 ? 8 : 4;
 static_assert(kNetworkTile % kSplatGroup == 0 && kSplatGroup % kSparseGroup == 0 && kSplatGroup % kPairGroup == 0);
 
@@ -88,13 +89,18 @@ HEADBENCH_INLINE void product_columns(const float* inputs, int stride, const std
     for (int v = 0; v < vectors; ++v) store(out + s * out_stride + v * W, relu ? max(sums[s][v], 0.0f) : sums[s][v]);
 }
 
+// How many vectors of the columns that are left to take: never one less than all, as a single one leaves registers idle.
+HEADBENCH_INLINE int vectors_at_once(int columns, int most) {
+  return columns >= most * W && columns != (most + 1) * W ? most : columns >= 2 * W ? 2 : 1;
+}
+
 // For the groups of a tile's rows: bias, if any, plus the listed inputs times their rows of the weights, `width` numbers
 // a row, at most `most_vectors` vectors of them at a time. Some columns for all groups before the next: their weights stay in the first cache.
 template <int rows, int most_vectors>
 inline void product(const float* inputs, int stride, const Lists<rows>& lists, int groups, const float* weights,
                     int weight_stride, int width, const float* bias, bool relu, float* out, int out_stride) {
   for (int column = 0; column < width;) {
-    const int vectors = width - column >= most_vectors * W ? most_vectors : width - column >= 2 * W ? 2 : 1;
+    const int vectors = vectors_at_once(width - column, most_vectors);
     for (int group = 0; group < groups; ++group) {
       const float *from = inputs + group * rows * stride, *some = weights + column, *start = bias ? bias + column : nullptr;
       const std::int32_t* list = lists.inputs + group * lists.stride;

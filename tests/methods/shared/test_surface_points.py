@@ -54,18 +54,35 @@ def test_a_neck_beyond_half_a_turn_has_axes_of_the_shorter_turn(clip):
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
-def test_posed_vertices_are_the_head_models(clip, head):
-    offset = np.random.default_rng(0).normal(scale=0.001, size=head.template.shape)
-    mesh = SubjectMesh(head, clip.shape, offset, "cpu")
-    model = HeadModel(head, dtype=torch.float64)
-    expected = model(
-        shape=torch.from_numpy(clip.shape),
-        static_offset=torch.from_numpy(offset),
-        **model.pose_arguments([clip.poses[1]]),
-    )[0]
-    np.testing.assert_allclose(mesh.posed(mesh.arguments([clip.poses[1]])), expected, atol=1e-6)
-    driven = mesh.drive(clip.poses[1]).center
-    np.testing.assert_allclose(driven, expected[mesh.faces].mean(1), atol=1e-6)
+@pytest.mark.parametrize("eyelids", [False, True])
+def test_posed_vertices_and_gradients_are_the_head_models(clip, head, eyelids):
+    rng = np.random.default_rng(0)
+    offset = rng.normal(scale=0.001, size=head.template.shape)
+    lids = rng.normal(scale=0.01, size=(*offset.shape, 2)) if eyelids else None
+    head = replace(head, eyelid_basis=lids)
+    mesh, model = SubjectMesh(head, clip.shape, offset, "cpu"), HeadModel(head, dtype=torch.float64)
+    pose = replace(clip.poses[1], neck=np.array([0.3, -0.2, 0.1]), eyelids=np.array([0.5, 0.2]))
+    canonical = model.canonical(torch.from_numpy(clip.shape), torch.from_numpy(offset))
+    weights = torch.from_numpy(rng.normal(size=offset.shape))
+    found, expected = mesh.arguments([pose]), model.pose_arguments([pose])
+    driven = mesh.drive(pose).center
+    np.testing.assert_allclose(
+        driven, model(canonical=canonical, **expected)[0][mesh.faces].mean(1), atol=1e-6
+    )
+    for arguments, vertices in (
+        (found, lambda: mesh.posed(found)),
+        (expected, lambda: model(canonical=canonical, **expected)[0]),
+    ):
+        for value in arguments.values():
+            value.requires_grad_()
+        posed = vertices()
+        posed.backward(weights.to(posed.dtype))
+        arguments["vertices"] = posed.detach()
+    np.testing.assert_allclose(found.pop("vertices"), expected.pop("vertices"), atol=1e-6)
+    assert ("eyelids" in found) == eyelids
+    for name, value in expected.items():
+        scale = float(value.grad.abs().max())
+        np.testing.assert_allclose(found[name].grad, value.grad, atol=1e-5 * scale, rtol=0, err_msg=name)
 
 
 def test_unposed_drops_rotation_neck_and_translation_only(clip, head):
