@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, relu
 
 from ...bench.native.dispatch import Operation
 from ...datasets.head.rotations import matrix_to_quaternion
@@ -301,6 +301,68 @@ class _DirectionsTo(torch.autograd.Function):
         by_means = empty_like(by_directions)
         call("direction_training", *ctx.saved_tensors, by_directions, by_means)
         return by_means, None, None, None, None
+
+
+def mean_over_visible(values: Tensor, visible: Tensor) -> Tensor:
+    """Mean of (N,) values where (N,) ``visible`` is true; 0 if there are none."""
+    weight = visible.to(values.dtype)
+    return (values * weight).sum() / weight.sum().clamp_min(1)
+
+
+def position_penalty(means: Tensor, visible: Tensor, threshold: float) -> Tensor:
+    """Mean over visible splats of the excess of (N, 3) local positions over the threshold (triangle sizes)."""
+    return mean_over_visible(relu(torch.linalg.vector_norm(means, dim=1) - threshold), visible)
+
+
+def scale_penalty(log_scales: Tensor, visible: Tensor, threshold: float) -> Tensor:
+    """Mean over visible splats of the norm of (N, 3) local scales' excess over the threshold.
+
+    The norm's gradient at zero is taken as 0.
+    """
+    excess = relu(log_scales.exp() - threshold)
+    return mean_over_visible(torch.linalg.vector_norm(excess, dim=1), visible)
+
+
+@Operation
+def splat_penalties(
+    means: Tensor,
+    log_scales: Tensor,
+    visible: Tensor,
+    thresholds: tuple[float, float],
+    weights: tuple[float, float],
+) -> Tensor:
+    """Weighted sum of `position_penalty` and `scale_penalty`, with the threshold and the weight of each."""
+    of_position = position_penalty(means, visible, thresholds[0])
+    return weights[0] * of_position + weights[1] * scale_penalty(log_scales, visible, thresholds[1])
+
+
+@splat_penalties.compiled(KERNEL)
+def _splat_penalties(
+    means: Tensor,
+    log_scales: Tensor,
+    visible: Tensor,
+    thresholds: tuple[float, float],
+    weights: tuple[float, float],
+) -> Tensor:
+    return _SplatPenalties.apply(means, log_scales, visible, *thresholds, *weights)  # type: ignore[no-untyped-call]
+
+
+class _SplatPenalties(torch.autograd.Function):
+    """Value and gradients are computed in one pass."""
+
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, log_scales: Tensor, *fixed: Any) -> Tensor:
+        gradients = empty_like(means), empty_like(log_scales)
+        ctx.save_for_backward(*gradients)
+        return means.new_tensor(call("penalties", means, log_scales, *fixed, *gradients))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        by_means, by_log_scales = ctx.saved_tensors
+        unscaled = grad == 1
+        by_means, by_log_scales = (each if unscaled else each * grad for each in (by_means, by_log_scales))
+        return by_means, by_log_scales, None, None, None, None, None
 
 
 def unturned(count: int) -> Tensor:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.functional import linear
 from torch.optim.adam import adam
@@ -95,26 +94,6 @@ def picture_ssim(picture: ByteArray, truth: ByteArray) -> float:
     """`mean_ssim` of two (H, W, 3) 8-bit images."""
     planes = [torch.from_numpy(image.astype(np.float32) / 255).permute(2, 0, 1) for image in (picture, truth)]
     return float(mean_ssim(*(image.contiguous() for image in planes)))
-
-
-def mean_over_visible(values: Tensor, visible: Tensor) -> Tensor:
-    """Mean of (N,) values where (N,) ``visible`` is true; 0 if there are none."""
-    weight = visible.to(values.dtype)
-    return (values * weight).sum() / weight.sum().clamp_min(1)
-
-
-def position_penalty(means: Tensor, visible: Tensor, threshold: float) -> Tensor:
-    """Mean over visible splats of the excess of (N, 3) local positions over the threshold (triangle sizes)."""
-    return mean_over_visible(F.relu(torch.linalg.vector_norm(means, dim=1) - threshold), visible)
-
-
-def scale_penalty(log_scales: Tensor, visible: Tensor, threshold: float) -> Tensor:
-    """Mean over visible splats of the norm of (N, 3) local scales' excess over the threshold.
-
-    The norm's gradient at zero is taken as 0.
-    """
-    excess = F.relu(log_scales.exp() - threshold)
-    return mean_over_visible(torch.linalg.vector_norm(excess, dim=1), visible)
 
 
 EPS = 1e-15

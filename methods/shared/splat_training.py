@@ -11,11 +11,11 @@ from torch import Tensor, nn
 
 from ...bench.contracts import Camera, Clip, FloatArray, FrameKey
 from ..ops.photometric import photometric_loss
-from ..ops.splats import TriangleFrames, WorldSplats, unturned
+from ..ops.splats import TriangleFrames, WorldSplats, splat_penalties, unturned
 from ..splats.request import Rendering
 from .config import DensifiedTraining, SplatSettings, SplatTraining
 from .loop import COST_GROWTH, Fit, TrainingImages, TrainingSummary, train
-from .optimisation import Densifier, Optimiser, OptimiserState, logit, position_penalty, scale_penalty
+from .optimisation import Densifier, Optimiser, OptimiserState, logit
 from .rendering import View, rasterize_view, scene_center, scene_extent, view_of
 from .schedule import DensifySchedule, Sampler, Timeline, log_linear
 
@@ -298,7 +298,7 @@ class BoundTraining(SplatTrainer):
         self._appearance.begin(timeline)
 
     def loss(self, iteration: int, index: int) -> Tensor:
-        """Photometric loss of one image and the regularisers of section 3.4 of GaussianAvatars."""
+        """Photometric loss of one image and the penalties of section 3.4 of GaussianAvatars."""
         key, settings, optimiser = self.keys[index], self._settings, self.optimiser
         view = self._views[key.camera]
         truth = self._images.get(iteration, index)
@@ -309,12 +309,7 @@ class BoundTraining(SplatTrainer):
         )
         means, log_scales = optimiser["means"], optimiser["log_scales"]
         loss = photometric_loss(rendering.image, truth, settings.ssim_weight)
-        loss = loss + splat_penalties(means, log_scales, visible, settings)
+        thresholds = settings.position_threshold, settings.scale_threshold
+        weights = settings.position_weight, settings.scale_weight
+        loss = loss + splat_penalties(means, log_scales, visible, thresholds, weights)
         return loss if placed.penalty is None else loss + placed.penalty
-
-
-def splat_penalties(means: Tensor, log_scales: Tensor, visible: Tensor, settings: SplatTraining) -> Tensor:
-    """Weighted sum of the penalties on local positions and scales, GaussianAvatars, section 3.4."""
-    of_position = position_penalty(means, visible, settings.position_threshold)
-    of_scale = scale_penalty(log_scales, visible, settings.scale_threshold)
-    return settings.position_weight * of_position + settings.scale_weight * of_scale

@@ -47,11 +47,13 @@ class _PosedMesh(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, rig: _Rig, *values: Tensor | None) -> Tensor:
-        *values, lids = values
+    def forward(ctx: Any, rig: _Rig, *values: Any) -> Tensor:
+        *tracked, lids = values
         model = rig.model
-        expression, *angles, translation = (value.detach()[0] for value in values)
-        rotations, ctx.derivatives = matrices_and_derivatives(torch.cat(angles).double().numpy().reshape(-1, 3))
+        expression, *angles, translation = (value.detach()[0] for value in tracked)
+        rotations, ctx.derivatives = matrices_and_derivatives(
+            torch.cat(angles).double().numpy().reshape(-1, 3)
+        )
         joints = rig.joints + (expression @ model.joint_matrix).numpy().reshape(-1, 3).astype(np.float64)
         turns, shifts = [rotations[0]], [joints[0] - rotations[0] @ joints[0]]
         for joint, parent in enumerate(model.parents[1:], start=1):

@@ -204,6 +204,13 @@ CASES = {
         lambda normal, count: (normal(count, 3), bound(count), normal(FACES, 9), normal(FACES, 3)),
         (0,),
     ),
+    "penalties": Case(
+        splats.splat_penalties,
+        lambda normal, count: (
+            *(normal(count, 3), normal(count, 3) - 0.5, torch.arange(count) % 3 > 0, (1.0, 0.6), (0.01, 2.0)),
+        ),
+        (0, 1),
+    ),
     "directions": Case(
         splats.directions_to,
         lambda normal, count: (normal(count, 3), 3 + normal(3), normal(FACES, 3, 3), bound(count)),

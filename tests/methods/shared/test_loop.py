@@ -7,10 +7,11 @@ from torch import nn
 from headbench.bench.contracts import Budget, PreparedMethod, no_progress
 from headbench.bench.errors import InputError
 from headbench.methods.ga.method import GA
+from headbench.methods.ops.splats import position_penalty, scale_penalty
 from headbench.methods.shared import loop
 from headbench.methods.shared import method as shared
 from headbench.methods.shared.loop import CHECKPOINT, Fit, train
-from headbench.methods.shared.optimisation import Optimiser, position_penalty, scale_penalty
+from headbench.methods.shared.optimisation import Optimiser
 from headbench.methods.shared.threads import threads, torch_threads
 
 
