@@ -47,10 +47,10 @@ class _PosedMesh(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, rig: _Rig, *values: Tensor | None) -> Tensor:
-        *values, lids = values
+    def forward(ctx: Any, rig: _Rig, *values: Any) -> Tensor:
+        *tracked, lids = values
         model = rig.model
-        expression, *angles, translation = (value.detach()[0] for value in values)
+        expression, *angles, translation = (value.detach()[0] for value in tracked)
         rotations, ctx.derivatives = matrices_and_derivatives(
             torch.cat(angles).double().numpy().reshape(-1, 3)
         )
