@@ -31,6 +31,8 @@ from headbench.bench.executors.settings import Execution
 from headbench.bench.registry import discover, resolve
 from headbench.bench.specs import COMMAND_GROUPS
 from headbench.datasets.lint.catalogue import GROUPS, RULES
+from headbench.datasets.synthetic.capture import synthesize
+from headbench.datasets.synthetic.command import SynthSettings
 from headbench.reports.papers import measured_figures, printed_figures
 
 OBJECT_TYPES = {
@@ -452,9 +454,10 @@ def run_settings_page() -> str:
 
 
 def function_settings(function: Any, leave_out: Iterable[str]) -> Iterator[Setting]:
-    """Keyword parameters of a function as settings."""
+    """Keyword parameters of a function as settings; those of the synthetic capture are described at its command."""
     hints = get_type_hints(function)
-    texts = section_texts(inspect.getdoc(function) or "", "Parameters")
+    described = field_texts(SynthSettings) if function is synthesize else {}
+    texts = described | section_texts(inspect.getdoc(function) or "", "Parameters")
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind is not parameter.KEYWORD_ONLY or name in leave_out:
             continue
