@@ -237,7 +237,7 @@ class RunSettings:
     machine; slurm, one job for each; auto, processes for several trainings on a CPU with several cores and 2 GB of free memory
     for each, otherwise inline. Default: auto."""
     workers: int | None = None
-    """Number of processes, with `--executor processes`. Default: one for each core."""
+    """Number of processes, with which `--executor auto` is `processes`. Default: one for each core."""
     unchecked: bool = False
     """Do not search the captures for errors of `headbench lint`, which stop a run; the record of the run says so."""
     dry_run: bool = False

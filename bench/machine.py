@@ -89,12 +89,13 @@ def _cgroup_limits(controller: str, *names: str) -> Iterator[list[str]]:
 
 
 def memory() -> tuple[int, int]:
-    """Memory of this machine in bytes, whole and available, within the limits of cgroups."""
+    """Memory of this machine in bytes, whole and available, within the limits of cgroups less what this process uses."""
     import psutil
 
     limits = [int(words[0]) for words in _cgroup_limits("memory", "memory.max", "memory.limit_in_bytes")]
     whole = psutil.virtual_memory()
-    return min([whole.total, *limits]), min([whole.available, *limits])
+    own = psutil.Process().memory_info().rss
+    return min([whole.total, *limits]), min([whole.available, *(limit - own for limit in limits)])
 
 
 def machine_record(device: str = "cpu") -> dict[str, Any]:

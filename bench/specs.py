@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, make_dataclass, replace
-from typing import Any, Literal, NamedTuple, TypeVar, get_type_hints
+from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_type_hints
 
 MAX_LABEL = 120
 LABEL = f"at most {MAX_LABEL} printable characters"
@@ -227,6 +227,8 @@ class MetricSpec:
     def __post_init__(self) -> None:
         """Refuse values that tables cannot show or results cannot be read with."""
         _check_labels(name=self.name, label=self.label, unit=self.unit)
+        if self.kind not in (kinds := get_args(MetricKind)):
+            raise ValueError(f"kind is {self.kind!r}; one of {', '.join(kinds)}")
         if not 0 <= self.digits <= MAX_DIGITS:
             raise ValueError(f"digits is {self.digits}; from 0 to {MAX_DIGITS}")
 

@@ -43,11 +43,11 @@ class RunData:
     clips: Mapping[str, Clip] | None = field(default=None, repr=False, compare=False)
 
     @classmethod
-    def read(cls, run: Path | FinishedRun) -> RunData:
+    def read(cls, run: str | Path | FinishedRun) -> RunData:
         """Read a run folder, unless the run is in memory. Raises `InputError` naming what is missing or malformed."""
         if isinstance(run, FinishedRun):
             return cls(run.folder, run.manifest, run.rows.labelled(), run.clips)
-        folder = RunFolder(run)
+        folder = RunFolder(Path(run))
         manifest = folder.read_manifest()
         return cls(folder, manifest, folder.read_rows(manifest))
 

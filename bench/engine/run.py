@@ -245,14 +245,18 @@ def check_capture(config: RunConfig, clip: Clip) -> None:
 
 
 def chosen(execution: Execution, plan: Plan) -> Execution:
-    """Replace the executor ``auto``: a training keeps little more than one core busy, so several are executed beside each other."""
+    """Replace the executor ``auto``: a training keeps little more than one core busy, so several are executed at once.
+
+    Not with limits in seconds, in which a training that shares the processor would do less.
+    """
     if execution.executor != "auto":
         return execution
     trainings = [j for j in plan.jobs if not (j.source or j.method.spec.trivial or j.cell.is_trained)]
-    possible = min(processor_count(), len(trainings), memory()[1] // WORKER_BYTES)
-    workers = min(execution.workers or possible, possible)
-    if plan.config.device != "cpu" or workers < 2:
+    workers = min(processor_count(), len(trainings), memory()[1] // WORKER_BYTES)
+    is_timed = any(job.method.budget.seconds is not None for job in trainings)
+    if plan.config.device != "cpu" or workers < 2 or is_timed:
         return replace(execution, executor="inline")
+    log.info("%d trainings at once; --executor inline: one after another", workers)
     return replace(execution, executor="processes", workers=workers)
 
 

@@ -147,7 +147,7 @@ class Schedule:
     is_done: Callable[[Task], bool]
     """Whether the results of a task with a successful outcome exist and are complete."""
     execution: Execution
-    """Execution settings; any executor except "inline"."""
+    """Execution settings, with the executor "processes" or "slurm"."""
     speed: bool = False
     """Whether the tasks measure speed, one at a time with all threads, see `Task.speed`."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -56,7 +56,8 @@ class Execution:
 
     executor: ExecutorName = "inline"
     """``inline``, sequentially in this process; ``processes``, in parallel on this machine; ``slurm``, one job per cell; ``auto``,
-    ``processes`` for several trainings on the CPU of a machine with several cores and memory for them, otherwise ``inline``."""
+    ``processes`` for several trainings on the CPU of a machine with several cores and memory for them, otherwise ``inline``. Commands
+    use ``auto`` by default."""
     workers: int | None = None
     """Number of ``processes``; None: one for each core."""
     threads: int | None = None
@@ -136,6 +137,8 @@ def chosen_execution(
         merge(merge({"executor": "auto"}, settings), options) if isinstance(settings, Mapping) else settings
     )
     execution = build(Execution, values, source, "execution.")
+    if execution.executor == "auto" and execution.workers is not None:
+        execution = replace(execution, executor="processes")
     given = {key: f"--set execution.{key}" for key in assigned} | {key: f"--{key}" for key in options}
     check_dependent(DEPENDENT, execution, given)
     return execution
@@ -149,7 +152,7 @@ class ExecutionOptions:
     """Executor, as for `headbench run`."""
 
     workers: int | None = None
-    """Number of processes, as for `headbench run`; only with `--executor processes`."""
+    """Number of processes, as for `headbench run`."""
 
     set: Annotated[
         tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="execution.KEY=VALUE")

@@ -406,9 +406,10 @@ def with_tracking(
     stored = read_arrays(place, members, sizes)
     timesteps = stored["timesteps"].tolist()
     poses = dict(zip(timesteps, columns.poses(stored["poses"], capture.head, capture.subject, timesteps)))
-    for lost in {key.timestep for key in capture.files}.difference(timesteps):
-        nearest = min(timesteps, key=lambda timestep: abs(timestep - lost))
-        poses[lost] = replace(poses[nearest], timestep=lost)
+    sequence = {key.timestep: key.sequence for key in capture.files}
+    for lost in sequence.keys() - poses.keys():
+        near = [each for each in timesteps if sequence[each] == sequence[lost]] or timesteps
+        poses[lost] = replace(poses[min(near, key=lambda timestep: abs(timestep - lost))], timestep=lost)
     train = tuple(key for key in capture.splits["train"] if key.timestep in timesteps)
     return capture.derive(
         "track",

@@ -18,6 +18,7 @@ import pytest
 
 from headbench.bench import cli
 from headbench.bench.condition import PLAIN, Condition
+from headbench.bench.contracts import Budget
 from headbench.bench.engine import cell as cells
 from headbench.bench.engine import config as runner_config
 from headbench.bench.engine import run as runner
@@ -667,17 +668,18 @@ def test_planned_cells_have_their_state_and_nothing_is_trained(config, toy, fini
 
 
 @pytest.mark.parametrize(
-    ("trainings", "cores", "gigabytes", "device", "workers"),
+    ("trainings", "cores", "gigabytes", "device", "seconds", "workers"),
     [
-        *((3, 2, 23, "cpu", 2), (2, 16, 23, "cpu", 2), (9, 16, 7, "cpu", 3)),
-        *((3, 1, 23, "cpu", None), (1, 2, 23, "cpu", None), (3, 2, 3, "cpu", None), (3, 2, 23, "cuda", None)),
+        *((3, 2, 23, "cpu", None, 2), (2, 16, 23, "cpu", None, 2), (9, 16, 7, "cpu", None, 3)),
+        *((3, 1, 23, "cpu", None, None), (1, 2, 23, "cpu", None, None), (3, 2, 3, "cpu", None, None)),
+        *((3, 2, 23, "cuda", None, None), (3, 2, 23, "cpu", 30.0, None)),
     ],
 )
 def test_trainings_on_cores_with_memory_run_at_once(
-    monkeypatch, trainings, cores, gigabytes, device, workers
+    monkeypatch, trainings, cores, gigabytes, device, seconds, workers
 ):
     def job(trivial=False, is_trained=False):
-        method = SimpleNamespace(spec=SimpleNamespace(trivial=trivial))
+        method = SimpleNamespace(spec=SimpleNamespace(trivial=trivial), budget=Budget(None, seconds))
         return SimpleNamespace(source=None, method=method, cell=SimpleNamespace(is_trained=is_trained))
 
     monkeypatch.setattr(runner, "processor_count", lambda: cores)
