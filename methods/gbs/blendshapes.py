@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag, normalize
+from torch.nn.functional import embedding_bag
 
 from ...bench.contracts import FloatArray, HeadAsset, HeadPose, IntArray
 from ...bench.errors import InputError
@@ -18,8 +18,8 @@ from ...datasets.head.arrays import HeadArrays
 from ...datasets.head.geometry import rigid_alignment
 from ...datasets.head.model import joint_motions, pose_feature
 from ...datasets.head.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
-from ..ops.planes import coefficient_count, turned_colors
-from ..ops.splats import WorldSplats, apply_matrices, left_products
+from ..ops.planes import coefficient_count, harmonic_colors
+from ..ops.splats import TriangleFrames, WorldSplats, points_on, to_world
 from ..shared.surface_points import (
     POINT_MEMBERS,
     MeshPoints,
@@ -97,17 +97,24 @@ class _SumEntries(torch.autograd.Function):
 
 
 class PosedAttributes(NamedTuple):
-    """Splats of a pose in the world: geometry, (N,) opacities, harmonics, and the (N, 3, 3) rotation of their axes."""
+    """Splats of a pose in the world: geometry, (N,) opacities, harmonics, and the (N, 9) rotation from the world to their axes."""
 
     world: WorldSplats
     opacities: Tensor
     sh_dc: Tensor
     sh_rest: Tensor
-    rotation: Tensor
+    inverse: Tensor
 
     def colors(self, center: Tensor, degree: int) -> Tensor:
         """(N, 3) as seen from a camera at ``center`` (3,); the harmonics turn with the surface."""
-        return turned_colors(self.sh_dc, self.sh_rest, self.world.means, self.rotation, center, degree)
+        vectors = self.world.means - center
+        along = points_on(vectors, _each(vectors), self.inverse, torch.zeros_like(vectors))
+        return harmonic_colors(self.sh_dc, self.sh_rest, along, degree)
+
+
+def _each(rows: Tensor) -> Tensor:
+    """(N,) int64 that bind each of N splats to a row of its own."""
+    return torch.arange(len(rows), device=rows.device)
 
 
 def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: PointMotions) -> PosedAttributes:
@@ -124,23 +131,25 @@ def apply_pose(neutral: Mapping[str, Tensor], differences: Tensor, motions: Poin
     by_rest = differences.shape[1] - sum(difference_widths(0).values())
     moved, scaled, turned, opaque, coloured, rest_change = differences.split([3, 3, 4, 1, 3, by_rest], dim=1)
     local = neutral["means"] + motions.shift + moved
-    means = apply_matrices(motions.linear, local) + motions.offset
-    quats = normalize(neutral["quats"] + motions.turn + turned, dim=1)
-    scales = (neutral["log_scales"] + scaled).exp().clamp(SMALLEST_SCALE, LARGEST_SCALE)
+    joints = TriangleFrames(
+        motions.linear.view(-1, 3, 3), motions.offset, torch.ones_like(local[:, 0]), motions.quaternion
+    )
+    turns, log_scales = neutral["quats"] + motions.turn + turned, neutral["log_scales"] + scaled
+    world = to_world(joints, _each(local), local, log_scales, turns)
     if by_rest:
         changed = by_rest // 3
         sums = rest[:, :, :changed] + rest_change.view(-1, 3, changed)
         rest = torch.cat([sums, rest[:, :, changed:]], dim=2)
     return PosedAttributes(
-        WorldSplats(means, apply_matrices(motions.product, quats), scales),
+        world._replace(scales=world.scales.clamp(SMALLEST_SCALE, LARGEST_SCALE)),
         torch.sigmoid(neutral["opacities"] + opaque[:, 0]),
         neutral["sh_dc"] + coloured,
         rest,
-        motions.rotation.reshape(-1, 3, 3),
+        motions.inverse,
     )
 
 
-PARTS = {"linear": 9, "offset": 3, "rotation": 9, "product": 16, "turn": 4, "shift": 3}
+PARTS = {"linear": 9, "offset": 3, "inverse": 9, "quaternion": 4, "turn": 4, "shift": 3}
 """Columns of the effect of a pose on each point."""
 
 
@@ -150,10 +159,10 @@ class PointMotions(NamedTuple):
     linear: Tensor
     offset: Tensor
     """(N, 9) and (N, 3), blended transforms of the joints with eyelids and translation; x -> A x + b."""
-    rotation: Tensor
-    """(N, 9), the rotation in ``linear``."""
-    product: Tensor
-    """(N, 16), the matrix of left multiplication by its quaternion."""
+    inverse: Tensor
+    """(N, 9), the inverse of the rotation in ``linear``."""
+    quaternion: Tensor
+    """(N, 4), the rotation in ``linear``."""
     turn: Tensor
     """(N, 4) blended initial differences of rotation, multiplied by the initial quaternion."""
     shift: Tensor
@@ -209,7 +218,7 @@ class Rig:
 
     @torch.no_grad()
     def motions(self, arguments: Mapping[str, Tensor]) -> Tensor:
-        """Effect of one pose on each point, (P, 44) in the columns of `PARTS`."""
+        """Effect of one pose on each point, (P, 32) in the columns of `PARTS`."""
         model, expression = self.mesh.model, arguments["expression"]
         coefficients = self.coefficients(arguments)
         angles = model.angles(*(arguments[name] for name in ("rotation", "neck", "jaw", "eyes")))
@@ -225,9 +234,9 @@ class Rig:
             offset = offset + self.at_points(lids) @ (rotations[0, 0] @ rotations[0, 1]).t()
         # Through the quaternion it is a rotation to rounding, however far the blended transforms are from one.
         quaternion = matrix_to_quaternion(nearest_rotation(linear.view(-1, 3, 3), SKINNING_STEPS))
-        rotation, product = quaternion_to_matrix(quaternion).flatten(1), left_products(quaternion).flatten(1)
+        inverse = quaternion_to_matrix(quaternion).mT.flatten(1)
         turn = (self.turns @ coefficients).view(-1, 4)[self.turned]
-        return torch.cat([linear, offset, rotation, product, turn, shift], dim=1)
+        return torch.cat([linear, offset, inverse, quaternion, turn, shift], dim=1)
 
 
 POLAR_STEPS = 8

@@ -340,7 +340,7 @@ class GBSAvatar(StoredSplatAvatar):
     def harmonics(self, pose: HeadPose) -> tuple[FloatArray, FloatArray]:
         """Colours of a pose; see `HarmonicAvatar`. They are stored along the splats' axes, which turn with the surface."""
         posed = self._last(pose, no_stage)
-        return turn_harmonics(posed.sh_dc, posed.sh_rest, posed.rotation)
+        return turn_harmonics(posed.sh_dc, posed.sh_rest, posed.inverse.view(-1, 3, 3).mT)
 
     @torch.no_grad()
     def changes(self, pose: HeadPose) -> Changes:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -343,20 +344,36 @@ def _splat_penalties(
 
 
 class _SplatPenalties(torch.autograd.Function):
-    """Value and gradients are computed in one pass."""
+    """Value and gradients in one pass; numpy's reductions of three numbers are faster than torch's."""
 
     @staticmethod
-    def forward(ctx: Any, means: Tensor, log_scales: Tensor, *fixed: Any) -> Tensor:
-        gradients = empty_like(means), empty_like(log_scales)
-        ctx.save_for_backward(*gradients)
-        return means.new_tensor(call("penalties", means, log_scales, *fixed, *gradients))
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        log_scales: Tensor,
+        visible: Tensor,
+        farthest: float,
+        largest: float,
+        *weights: float,
+    ) -> Tensor:
+        positions, scales, seen = means.detach().numpy(), np.exp(log_scales.detach().numpy()), visible.numpy()
+        by_position, by_scale = (weight / max(int(np.count_nonzero(seen)), 1) for weight in weights)
+        # Numbers that are none are not within a threshold, so that they show in the loss.
+        length = np.sqrt(np.einsum("nk,nk->n", positions, positions))
+        of_far = np.float32(by_position) * (seen & ~(length <= farthest))
+        by_means = (of_far / np.maximum(length, np.float32(NORM_FLOOR)))[:, None] * positions
+        large = np.unique(np.flatnonzero(~(scales.ravel() <= largest)) // 3)
+        excess, of_large = np.maximum(scales[large] - largest, 0), by_scale * seen[large]
+        size = np.sqrt((excess**2).sum(1))
+        by_log_scales = np.zeros_like(scales)
+        by_log_scales[large] = (of_large / np.maximum(size, NORM_FLOOR))[:, None] * excess * scales[large]
+        ctx.gradients = torch.from_numpy(by_means), torch.from_numpy(by_log_scales)
+        return means.new_tensor(of_far @ (length - farthest) + of_large @ size)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        by_means, by_log_scales = ctx.saved_tensors
-        unscaled = grad == 1
-        by_means, by_log_scales = (each if unscaled else each * grad for each in (by_means, by_log_scales))
+        by_means, by_log_scales = ctx.gradients if grad == 1 else [grad * each for each in ctx.gradients]
         return by_means, by_log_scales, None, None, None, None, None
 
 

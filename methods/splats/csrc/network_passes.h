@@ -37,21 +37,12 @@ HEADBENCH_INLINE void outer_columns(const float* left, int left_stride, const st
 template <int rows, int most_vectors>
 inline void outer_product(const float* left, int left_stride, const Lists<rows>& lists, int groups, const float* right,
                           int right_stride, int width, float* sums) {
-  for (int column = 0; column < width;) {
-    const int vectors = vectors_at_once(width - column, most_vectors);
-    for (int group = 0; group < groups; ++group) {
-      const float *values = left + group * rows * left_stride, *some = right + group * rows * right_stride + column;
-      const std::int32_t* list = lists.inputs + group * lists.stride;
-      const int count = lists.counts[group];
-      if (vectors == most_vectors)
-        outer_columns<rows, most_vectors>(values, left_stride, list, count, some, right_stride, sums + column, width);
-      else if (vectors == 2)
-        outer_columns<rows, 2>(values, left_stride, list, count, some, right_stride, sums + column, width);
-      else
-        outer_columns<rows, 1>(values, left_stride, list, count, some, right_stride, sums + column, width);
-    }
-    column += vectors * W;
-  }
+  for_columns<most_vectors>(width, [&](auto vectors, int column) {
+    for (int group = 0; group < groups; ++group)
+      outer_columns<rows, decltype(vectors)::value>(
+          left + group * rows * left_stride, left_stride, lists.inputs + group * lists.stride, lists.counts[group],
+          right + group * rows * right_stride + column, right_stride, sums + column, width);
+  });
 }
 
 // Ask for what the next tile reads of the forward pass, `most` of the `left` numbers there are: it comes from far away.

@@ -89,9 +89,25 @@ HEADBENCH_INLINE void product_columns(const float* inputs, int stride, const std
     for (int v = 0; v < vectors; ++v) store(out + s * out_stride + v * W, relu ? max(sums[s][v], 0.0f) : sums[s][v]);
 }
 
-// How many vectors of the columns that are left to take: never one less than all, as a single one leaves registers idle.
-HEADBENCH_INLINE int vectors_at_once(int columns, int most) {
-  return columns >= most * W && columns != (most + 1) * W ? most : columns >= 2 * W ? 2 : 1;
+template <int count>
+struct Vectors {
+  static constexpr int value = count;
+};
+
+// Call body(Vectors<n>, column) until `width` columns are done, n vectors of them at a time: `most`, or else two or one. A
+// single one leaves registers idle, so that none is left over where it can be avoided.
+template <int most, class Body>
+HEADBENCH_INLINE void for_columns(int width, const Body& body) {
+  for (int column = 0; column < width;) {
+    const int left = (width - column) / W, now = left >= most && left != most + 1 ? most : left >= 2 ? 2 : 1;
+    if (now == most)
+      body(Vectors<most>{}, column);
+    else if (now == 2)
+      body(Vectors<2>{}, column);
+    else
+      body(Vectors<1>{}, column);
+    column += now * W;
+  }
 }
 
 // For the groups of a tile's rows: bias, if any, plus the listed inputs times their rows of the weights, `width` numbers
@@ -99,22 +115,12 @@ HEADBENCH_INLINE int vectors_at_once(int columns, int most) {
 template <int rows, int most_vectors>
 inline void product(const float* inputs, int stride, const Lists<rows>& lists, int groups, const float* weights,
                     int weight_stride, int width, const float* bias, bool relu, float* out, int out_stride) {
-  for (int column = 0; column < width;) {
-    const int vectors = vectors_at_once(width - column, most_vectors);
-    for (int group = 0; group < groups; ++group) {
-      const float *from = inputs + group * rows * stride, *some = weights + column, *start = bias ? bias + column : nullptr;
-      const std::int32_t* list = lists.inputs + group * lists.stride;
-      const int count = lists.counts[group];
-      float* to = out + group * rows * out_stride + column;
-      if (vectors == most_vectors)
-        product_columns<rows, most_vectors>(from, stride, list, count, some, weight_stride, start, relu, to, out_stride);
-      else if (vectors == 2)
-        product_columns<rows, 2>(from, stride, list, count, some, weight_stride, start, relu, to, out_stride);
-      else
-        product_columns<rows, 1>(from, stride, list, count, some, weight_stride, start, relu, to, out_stride);
-    }
-    column += vectors * W;
-  }
+  for_columns<most_vectors>(width, [&](auto vectors, int column) {
+    for (int group = 0; group < groups; ++group)
+      product_columns<rows, decltype(vectors)::value>(
+          inputs + group * rows * stride, stride, lists.inputs + group * lists.stride, lists.counts[group], weights + column,
+          weight_stride, bias ? bias + column : nullptr, relu, out + group * rows * out_stride + column, out_stride);
+  });
 }
 
 // The sums of the lanes of four vectors.

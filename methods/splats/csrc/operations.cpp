@@ -1,8 +1,6 @@
 // The operations of methods/ops on meshes and splats, as functions of the Python module: arrays in the order of the structs'
 // members, the inputs first. Work is divided alike for any number of threads, and sums are taken in one order, so that
 // results are equal bit for bit.
-#include <algorithm>
-#include <cmath>
 #include <string>
 #include <vector>
 
@@ -174,43 +172,6 @@ void offset_network(const nb::tuple& arrays, const std::string& instruction_set,
   });
 }
 
-// Sums over all splats, so that a number that is none shows in the result.
-double penalties(const nb::tuple& arguments, const std::string&, int) {
-  Arguments from(arguments);
-  Size count;
-  const float *means = from(count, 3), *log_scales = from(count, 3);
-  const bool* visible = from(count);
-  const float farthest = from.number<float>(), largest = from.number<float>(), log_largest = std::log(largest);
-  const double position_weight = from.number<double>(), scale_weight = from.number<double>();
-  float *by_means = from(count, 3), *by_log_scales = from(count, 3);
-  const nb::gil_scoped_release unlocked;
-  std::fill_n(by_means, 3 * count, 0.0f);
-  std::fill_n(by_log_scales, 3 * count, 0.0f);
-  const double seen = static_cast<double>(std::max<std::int64_t>(std::count(visible, visible + count, true), 1));
-  double position = 0.0, scale = 0.0;
-  for (std::int64_t splat = 0; splat < count; ++splat) {
-    const float *mean = means + 3 * splat, *logs = log_scales + 3 * splat, counts = visible[splat] ? 1.0f : 0.0f;
-    const float length = std::sqrt(mean[0] * mean[0] + mean[1] * mean[1] + mean[2] * mean[2]);
-    if (!(length <= farthest)) {
-      position += counts * (length - farthest);
-      const float factor = counts * static_cast<float>(position_weight / seen) / length;
-      for (int k = 0; k < 3; ++k) by_means[3 * splat + k] = factor * mean[k];
-    }
-    if (logs[0] <= log_largest && logs[1] <= log_largest && logs[2] <= log_largest) continue;
-    float scales[3], excess[3], square = 0.0f;
-    for (int k = 0; k < 3; ++k) {
-      scales[k] = std::exp(logs[k]);
-      excess[k] = scales[k] <= largest ? 0.0f : scales[k] - largest;
-      square += excess[k] * excess[k];
-    }
-    if (square == 0.0f) continue;
-    scale += counts * std::sqrt(square);
-    const float factor = counts * static_cast<float>(scale_weight / seen) / std::sqrt(square);
-    for (int k = 0; k < 3; ++k) by_log_scales[3 * splat + k] = factor * excess[k] * scales[k];
-  }
-  return (position_weight * position + scale_weight * scale) / seen;
-}
-
 double photometric(const nb::tuple& arguments, const std::string& instruction_set, int threads) {
   constexpr std::int64_t kRowsPerTask = 48;
   Arguments from(arguments);
@@ -256,7 +217,6 @@ void bind_operations(nb::module_& m) {
   define("shade", &shade, "Write the colours of spherical harmonics; rotations may be None.");
   define("color_network", &color_network, "Write the colours of the colour network.");
   define("offset_network", &offset_network, "Write the offsets of the splats named, those of no others.");
-  define("penalties", &penalties, "Weighted penalties on far and large splats; writes the gradients by means and log-scales.");
   define("photometric", &photometric, "The photometric loss of two images; writes its gradient by the first.");
 }
 

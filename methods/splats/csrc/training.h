@@ -346,21 +346,13 @@ inline void harmonics_degree_backward(const TrainedHarmonics& in, std::int64_t b
   }
 }
 
+template <bool backward>
 inline void harmonics(const TrainedHarmonics& in, std::int64_t begin, std::int64_t end) {
   switch (in.degree) {
-    case 0: return harmonics_degree<0>(in, begin, end);
-    case 1: return harmonics_degree<1>(in, begin, end);
-    case 2: return harmonics_degree<2>(in, begin, end);
-    default: return harmonics_degree<3>(in, begin, end);
-  }
-}
-
-inline void harmonics_backward(const TrainedHarmonics& in, std::int64_t begin, std::int64_t end) {
-  switch (in.degree) {
-    case 0: return harmonics_degree_backward<0>(in, begin, end);
-    case 1: return harmonics_degree_backward<1>(in, begin, end);
-    case 2: return harmonics_degree_backward<2>(in, begin, end);
-    default: return harmonics_degree_backward<3>(in, begin, end);
+    case 0: return backward ? harmonics_degree_backward<0>(in, begin, end) : harmonics_degree<0>(in, begin, end);
+    case 1: return backward ? harmonics_degree_backward<1>(in, begin, end) : harmonics_degree<1>(in, begin, end);
+    case 2: return backward ? harmonics_degree_backward<2>(in, begin, end) : harmonics_degree<2>(in, begin, end);
+    default: return backward ? harmonics_degree_backward<3>(in, begin, end) : harmonics_degree<3>(in, begin, end);
   }
 }
 

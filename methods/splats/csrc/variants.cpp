@@ -66,7 +66,7 @@ extern const Kernels kernels;
 const Kernels kernels = {HEADBENCH_ISA_NAME, W, project, find_entries, scratch_floats, draw_tile, draw_tile_backward,
                          project_backward, count_work, multiply_add, kChains, triangles, to_world, shade, turns,
                          color_network, offset_scratch, offset_network,
-                         triangles_backward, activate, to_world_backward, harmonics, harmonics_backward,
+                         triangles_backward, activate, to_world_backward, harmonics<false>, harmonics<true>,
                          photometric_scratch, photometric};
 
 }  // namespace headbench::HEADBENCH_ISA

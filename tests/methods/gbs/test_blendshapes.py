@@ -147,8 +147,8 @@ def test_every_attribute_is_the_sum_that_the_paper_gives(head):
     parts = dict(zip(widths, table.split(list(widths.values()), dim=1)))
     # A pose at rest but for the shift and turn of the differences.
     columns = {name: torch.zeros(60, width) for name, width in PARTS.items()}
-    columns["linear"] = columns["rotation"] = torch.eye(3).flatten().repeat(60, 1)
-    columns["product"] = torch.eye(4).flatten().repeat(60, 1)
+    columns["linear"] = columns["inverse"] = torch.eye(3).flatten().repeat(60, 1)
+    columns["quaternion"] = torch.eye(4)[:1].repeat(60, 1)
     columns["shift"], columns["turn"] = torch.full((60, 3), 0.01), torch.full((60, 4), 0.02)
     posed = apply_pose(neutral, table, PointMotions(**columns))
     torch.testing.assert_close(posed.world.means, neutral["means"] + 0.01 + parts["means"])
