@@ -196,6 +196,7 @@ def train(
 @contextmanager
 def _collecting_new_objects() -> Iterator[None]:
     """Exempt all existing objects from garbage collection, which would traverse the imported modules every few iterations."""
+    gc.collect()  # frozen garbage, such as an earlier cell's, would stay in memory
     gc.freeze()
     try:
         yield
