@@ -198,7 +198,10 @@ class Rig:
         model = self.mesh.model
         self.expressions = min(expressions, model.expression_size)
         self.at_points = MeshPoints(points, self.mesh.faces, model.template)
-        self._weights = self.at_points(model.skinning_weights)
+        # Most points follow one joint, or have the weights of another point: transforms are computed once for each.
+        self._weights, self._weighted = torch.unique(
+            self.at_points(model.skinning_weights), dim=0, return_inverse=True
+        )
         self.rest = self.at_points(self.mesh.canonical)
         self._basis = torch.cat([model.expression_matrix[: self.expressions], model.pose_matrix])
         basis = model.expression_matrix[: self.expressions].t().unflatten(0, (-1, 3))
@@ -226,17 +229,19 @@ class Rig:
         joints = model.rest_joints(self.mesh.canonical[None], expression)
         motions = joint_motions(rotations, joints, model.parents)[0]
         blended = (self._weights @ motions.flatten(1)).view(-1, 3, 4)
-        linear, offset = blended[:, :, :3].flatten(1), blended[:, :, 3] + arguments["translation"]
+        linear = blended[:, :, :3].contiguous()
+        # Through the quaternion it is a rotation to rounding, however far the blended transforms are from one.
+        quaternion = matrix_to_quaternion(nearest_rotation(linear, SKINNING_STEPS))
+        inverse = quaternion_to_matrix(quaternion).mT.flatten(1)
+        offset = blended[:, :, 3] + arguments["translation"]
+        followed = torch.cat([linear.flatten(1), offset, inverse, quaternion], dim=1)[self._weighted]
         feature = pose_feature(rotations)[0]
         shift = self.at_points((torch.cat([coefficients, feature]) @ self._basis).view(-1, 3))
         if "eyelids" in arguments and model.eyelid_matrix is not None:
             lids = (arguments["eyelids"][0] @ model.eyelid_matrix).view(-1, 3)
-            offset = offset + self.at_points(lids) @ (rotations[0, 0] @ rotations[0, 1]).t()
-        # Through the quaternion it is a rotation to rounding, however far the blended transforms are from one.
-        quaternion = matrix_to_quaternion(nearest_rotation(linear.view(-1, 3, 3), SKINNING_STEPS))
-        inverse = quaternion_to_matrix(quaternion).mT.flatten(1)
+            followed[:, 9:12] += self.at_points(lids) @ (rotations[0, 0] @ rotations[0, 1]).t()
         turn = (self.turns @ coefficients).view(-1, 4)[self.turned]
-        return torch.cat([linear, offset, inverse, quaternion, turn, shift], dim=1)
+        return torch.cat([followed, turn, shift], dim=1)
 
 
 POLAR_STEPS = 8
