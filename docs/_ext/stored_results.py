@@ -2,7 +2,7 @@
 
 python docs/_ext/stored_results.py WHAT OUT .
 
-WHAT is demo, suite, profiles or faces (a run of one subject), further or mechanisms (a folder of runs) or curves (a folder of
+WHAT is demo, suite, profiles, faces or frames (a run of one subject), further or mechanisms (a folder of runs) or curves (a folder of
 seconds and pictures); OUT is the folder of the run or runs. A block of a page is between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``.
 """
 
