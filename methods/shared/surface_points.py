@@ -130,7 +130,7 @@ class SubjectMesh:
         self._rig = _Rig(
             self.model,
             self.canonical.reshape(-1),
-            (self.model.joint_regressor @ self.canonical).numpy(force=True),
+            (self.model.joint_regressor @ self.canonical).cpu().numpy(),
             self.model.skinning_weights.t().contiguous(),
         )
         check_size(
