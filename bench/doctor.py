@@ -166,7 +166,6 @@ class PluginStatus(NamedTuple):
 @command("doctor", group="validate")
 def doctor(settings: DoctorSettings, progress: Progress) -> CommandResult:
     """Report what methods, metrics and readers lack here, and how to install it."""
-
     assigned = parse_assignments(settings.set)
     stray = set(assigned) - {"settings"}
     if stray:

@@ -25,7 +25,8 @@ def locked(folder: Path, *, beside: bool = False) -> Iterator[None]:
     """Lock ``folder`` within the block; the lock file names the owner.
 
     The lock ends with its process: the file of a killed process locks nobody out. While locked, temporary files of
-    killed processes are removed. ``beside`` creates the lock file beside the folder, for folders that must be empty. A new folder without content is removed.
+    killed processes are removed. ``beside`` creates the lock file beside the folder, for folders that must be empty. A new folder
+    without content is removed.
     """
     path = folder.resolve().parent / f".{folder.resolve().name}.lock" if beside else folder / LOCK_FILE
     with removed_if_empty(folder):
