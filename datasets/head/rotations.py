@@ -127,8 +127,8 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     # The diagonal sums to 4, so its largest entry is at least 1 for any matrix, and there is no division by 0.
     largest = products.diagonal().t().contiguous().max(0).indices
     chosen = products.gather(0, largest.expand(1, 4, -1))[0]
-    unit = chosen / chosen.square().sum(0).sqrt()
-    return torch.where(unit[:1] < 0, -unit, unit).t().contiguous().view(*matrix.shape[:-2], 4)
+    length = torch.copysign(chosen.square().sum(0).sqrt(), chosen[0])  # with the sign of w
+    return (chosen / length).t().contiguous().view(*matrix.shape[:-2], 4)
 
 
 _GENERATORS = np.array(

@@ -380,11 +380,12 @@ def shader(from_position: Tensor, of_direction: Tensor, last: Tensor) -> Shader:
     - ``from_position``: (N, H) contribution of the planes to the hidden layer.
     - ``of_direction``, ``last``: (27, H) and (3, H) weights of the encoded direction and of the hidden layer.
     """
+    half = torch.full_like(last[:, 0], 0.5)
 
     def shade(means: Tensor, center: Tensor, turns: Tensor, binding: Tensor) -> Tensor:
         directions = directions_to(means, center, turns, binding)
         hidden = torch.relu(torch.addmm(from_position, encode(directions), of_direction))
-        return torch.relu(0.5 + C0 * (hidden @ last.t()))
+        return torch.relu(torch.addmm(half, hidden, last.t(), alpha=C0))
 
     return shade
 

@@ -47,8 +47,7 @@ class PreparedTimestep:
 
     frames: TriangleFrames
     turns: Tensor  # (F, 3, 3) world directions to canonical ones
-    expression: Tensor  # (E,)
-    jaw: Tensor  # (J,)
+    coefficients: Tensor  # (2, E + J), see `driving_coefficients`
     penalty: Tensor  # (F,)
 
 
@@ -136,7 +135,7 @@ class OursAppearance:
             splats = splats._replace(color_change=optimiser[RESIDUAL])
         penalty = None
         if self._config.lines.enabled and iteration > self._lines_from:
-            offsets = self.offsets(optimiser, positions.detach(), prepared.expression, prepared.jaw)
+            offsets = self.offsets(optimiser, positions.detach(), prepared.coefficients)
             splats = apply_offsets(splats, offsets, self._config.lines.dynamic)
             if self._config.penalty.weight:
                 weights = prepared.penalty.index_select(0, binding)
@@ -157,9 +156,9 @@ class OursAppearance:
             RAMP_FROM, 1.0, (iteration - self._lines_from) / ramp if ramp else 1.0
         )
 
-    def offsets(self, optimiser: Optimiser, positions: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
+    def offsets(self, optimiser: Optimiser, positions: Tensor, coefficients: Tensor) -> Tensor:
         """(N, D) offsets; zero outside the lines' box."""
-        blended = blend_lines(optimiser["lines"], expression, jaw)
+        blended = blend_lines(optimiser["lines"], coefficients)
         table = line_table(blended, normalised_weight(optimiser, 0))
         return line_offsets(positions, self.line_box, table, offset_layers(optimiser))
 
@@ -193,23 +192,25 @@ class OursAppearance:
         pose = self._clip.poses[timestep]
         arguments = self._mesh.arguments([pose])
         frames = self._mesh.frames(self._mesh.posed(arguments))
-        expression, jaw = (
-            torch.from_numpy(values).to(self._device)
-            for values in driving_coefficients(pose, self.expressions, self.jaw_bases)
-        )
+        coefficients = driving_coefficients(pose, self.expressions, self.jaw_bases)
         weights = frames.size.new_zeros(len(frames.size))
         if self._config.lines.enabled and self._config.penalty.weight:
             meshes = self._mesh.unposed(arguments), self._mesh.canonical
             weights = penalty_weights(*meshes, self._mesh.faces, self._is_face, self._config)
-        return PreparedTimestep(frames, self.canonical.turns(frames), expression, jaw, weights)
+        blending = torch.from_numpy(coefficients).to(self._device)
+        return PreparedTimestep(frames, self.canonical.turns(frames), blending, weights)
 
 
-def driving_coefficients(
-    pose: HeadPose, expressions: int, bases: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Blend coefficients of the lines, float32: leading expression coefficients, and weights of the jaw bases."""
-    jaw = jaw_weights(jaw_quaternions([pose]), bases)[0] if len(bases) else np.zeros(0)
-    return np.array(pose.expression[:expressions], np.float32), np.asarray(jaw, np.float32)
+def driving_coefficients(pose: HeadPose, expressions: int, bases: FloatArray) -> FloatArray:
+    """(2, E + J) blend coefficients of the lines, float32.
+
+    The first row has the leading expression coefficients, the second the weights of the jaw bases; the rest is 0.
+    """
+    coefficients = np.zeros((2, expressions + len(bases)), np.float32)
+    coefficients[0, :expressions] = pose.expression[:expressions]
+    if len(bases):
+        coefficients[1, expressions:] = jaw_weights(jaw_quaternions([pose]), bases)[0]
+    return coefficients
 
 
 def softened(offsets: Tensor, softness: float) -> Tensor:

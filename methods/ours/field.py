@@ -89,16 +89,13 @@ class NamedTensors(Protocol):
     def __getitem__(self, name: str, /) -> Tensor: ...
 
 
-def blend_lines(lines: Tensor, expression: Tensor, jaw: Tensor) -> Tensor:
+def blend_lines(lines: Tensor, coefficients: Tensor) -> Tensor:
     """Blend once per frame: (2, 3, L, C), expression lines first, then jaw lines.
 
     - ``lines``: (E + J, 3, L, C).
-    - ``expression``, ``jaw``: (E,) coefficients and (J,) weights.
+    - ``coefficients``: (2, E + J), see `appearance.driving_coefficients`.
     """
-    flat = lines.flatten(1)
-    count = len(expression)
-    blended = torch.stack([expression @ flat[:count], jaw @ flat[count:]])
-    return blended.view(2, *lines.shape[1:])
+    return (coefficients @ lines.flatten(1)).view(2, *lines.shape[1:])
 
 
 def offset_layers(parameters: NamedTensors) -> OffsetLayers:
@@ -116,8 +113,8 @@ def line_table(blended: Tensor, first: Tensor) -> Tensor:
     The layer's inputs are [e_x e_y e_z j_x j_y j_z], C features of each line.
     """
     kinds, axes, resolution, channels = blended.shape
-    weights = first.view(-1, kinds, axes, channels)
-    return torch.einsum("kalc,hkac->alh", blended, weights).reshape(axes * resolution, -1)
+    weights = first.view(-1, kinds * axes, channels).permute(1, 2, 0)
+    return torch.bmm(blended.flatten(0, 1), weights).view(kinds, axes * resolution, -1).sum(0)
 
 
 def normalised_weight(parameters: NamedTensors, layer: int) -> Tensor:

@@ -294,7 +294,6 @@ class LineOffsets:
 
     def __init__(self, tensors: Mapping[str, Tensor], positions: Tensor):
         self._lines, self._count = tensors["lines"], len(positions)
-        self._jaw_bases = len(tensors["jaw_bases"])
         box = Bounds(*tensors["line_box"])
         inside = box.contains(positions).nonzero().squeeze(1)
         unit = box.unit(positions.index_select(0, inside))
@@ -307,7 +306,7 @@ class LineOffsets:
         self._write = offset_writer(layers, LinePosition(*(part[order] for part in position)))
 
     def __call__(self, coefficients: Tensor) -> Tensor:
-        """(N, D) offsets of all splats for the (E + J,) coefficients of a frame, jaw weights last."""
+        """(N, D) offsets of all splats for the (2, E + J) coefficients of a frame, see `driving_coefficients`."""
         table = self.table(coefficients)
         out = table.new_empty if len(self.inside) == self._count else table.new_zeros
         offsets = out(self._count, self._outputs)
@@ -316,8 +315,7 @@ class LineOffsets:
 
     def table(self, coefficients: Tensor) -> Tensor:
         """(3 L, H) first layer without its bias, at the samples of a frame's blended lines."""
-        expression, jaw = coefficients.split([len(coefficients) - self._jaw_bases, self._jaw_bases])
-        return line_table(blend_lines(self._lines, expression, jaw), self._first)
+        return line_table(blend_lines(self._lines, coefficients), self._first)
 
 
 def _lexicographic(rows: Tensor, resolution: int) -> Tensor:
@@ -426,8 +424,8 @@ class OursAvatar(StoredSplatAvatar):
         """The splats with the offsets of the lines, if any."""
         if self.line_offsets is None:
             return self.neutral
-        driving = driving_coefficients(pose, self._expressions, self._jaw_bases)
-        coefficients = to_device(torch.from_numpy(np.concatenate(driving)), self._binding.device)
+        driving = torch.from_numpy(driving_coefficients(pose, self._expressions, self._jaw_bases))
+        coefficients = to_device(driving, self._binding.device)
         return apply_offsets(self.neutral, self.line_offsets(coefficients), self.field.dynamic)
 
 

@@ -23,7 +23,7 @@ def found(tmp_path_factory):
     return result_of("methods.pretended_trial", tmp_path_factory.mktemp("pretended"))
 
 
-OPERATIONS = {"flashavatar": 410, "ga": 70, "gbs": 305, "gha": 130, "ours": 105, "rgbavatar": 290}
+OPERATIONS = {"flashavatar": 410, "ga": 52, "gbs": 302, "gha": 130, "ours": 78, "rgbavatar": 270}
 """Operations of a frame without the rasteriser's, at most: a GPU spends several microseconds on the start of each."""
 
 

@@ -221,6 +221,8 @@ inline void color_network(const ColorNetwork& net, std::int64_t begin, std::int6
           fraction.put(fractions, lane);
           at[k] = place_of(net.table, net.hidden, rows, fractions);
           known[k] = net.positions + (first + lane) * net.hidden;
+          // A frame reads them once, from the last cache level.
+          for (int unit = 0; unit < net.hidden; unit += 32) HEADBENCH_PREFETCH(known[k] + W * net.hidden + unit);
           for (int channel = 0; channel < 3; ++channel) sum[channel][k] = 0.0f;
         }
         for (int unit = 0; unit < net.hidden; unit += W) {

@@ -9,8 +9,10 @@ import torch
 from headbench.bench.errors import InputError
 from headbench.bench.native import dispatch
 from headbench.datasets.head.arrays import faces_in_region
+from headbench.datasets.steps.clusters import jaw_quaternions, jaw_weights
 from headbench.methods.ops.planes import Bounds, line_offsets
 from headbench.methods.ours.appearance import (
+    driving_coefficients,
     expressive_triangles,
     outer_layers_start,
     penalty_weights,
@@ -156,6 +158,15 @@ def test_a_static_face_has_no_outer_layers(clip, mesh):
     assert len(start.binding) == len(mesh.faces)
 
 
+def test_expressions_and_jaw_bases_blend_apart(clip):
+    pose, bases = clip.poses[next(iter(clip.poses))], jaw_quaternions([*clip.poses.values()])[:2]
+    found = driving_coefficients(pose, 3, bases)
+    expected = np.zeros((2, 5))
+    expected[0, :3], expected[1, 3:] = pose.expression[:3], jaw_weights(jaw_quaternions([pose]), bases)[0]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert found.dtype == np.float32
+
+
 def directions(count, seed=0, dtype=torch.float32):
     generator = torch.Generator().manual_seed(seed)
     return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=dtype), dim=1)
@@ -166,15 +177,14 @@ def test_offsets_are_those_of_training(clip, tmp_path):
     low, high = tensors["line_box"]
     generator = torch.Generator().manual_seed(4)
     points = low + (high - low) * (1.4 * torch.rand(15000, 3, generator=generator) - 0.2)
-    jaw = torch.rand(len(tensors["jaw_bases"]), generator=generator)
-    expression = torch.randn(len(tensors["lines"]) - len(jaw), generator=generator)
-    found = LineOffsets(tensors, points)(torch.cat([expression, jaw]))
-    table = line_table(blend_lines(tensors["lines"], expression, jaw), normalised_weight(tensors, 0))
+    coefficients = torch.randn(2, len(tensors["lines"]), generator=generator)
+    found = LineOffsets(tensors, points)(coefficients)
+    table = line_table(blend_lines(tensors["lines"], coefficients), normalised_weight(tensors, 0))
     expected = line_offsets(points, Bounds(low, high), table, offset_layers(tensors))
     np.testing.assert_allclose(found, expected, atol=1e-5)
     assert 1000 < (found == 0).all(1).sum() < 14000
     exact = {name: value.double() for name, value in tensors.items()}
-    slow = LineOffsets(exact, points.double())(torch.cat([expression, jaw]).double())
+    slow = LineOffsets(exact, points.double())(coefficients.double())
     np.testing.assert_allclose(found, slow, atol=1e-5)
 
 

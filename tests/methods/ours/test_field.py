@@ -260,6 +260,6 @@ def test_the_network_starts_within_its_fan_in_with_its_norms():
 
 
 def test_lines_are_summed_by_expression_and_jaw_weights():
-    lines, expression, jaw = torch.randn(5, 3, 4, 2), torch.randn(3), torch.tensor([0.8, 0.2])
-    expected = [np.einsum("k,kalc->alc", w, each) for w, each in ((expression, lines[:3]), (jaw, lines[3:]))]
-    np.testing.assert_allclose(blend_lines(lines, expression, jaw), expected, atol=1e-6)
+    lines, coefficients = torch.randn(5, 3, 4, 2), torch.tensor([[0.3, -2, 1, 0, 0], [0, 0, 0, 0.8, 0.2]])
+    expected = [np.einsum("k,kalc->alc", row, lines) for row in coefficients]
+    np.testing.assert_allclose(blend_lines(lines, coefficients), expected, atol=1e-6)
