@@ -6,7 +6,8 @@ length of one camera from landmarks of a head model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple, cast
 
@@ -14,10 +15,13 @@ import cv2
 import numpy as np
 from scipy.sparse import csr_array
 
-from ...bench.contracts import Camera, FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.contracts import BoolArray, Camera, FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError
+from ..head.geometry import vertex_normals
 from .landmarks import ImageLandmarks, spread_vertices
-from .rig import FrameStack, Occlusion, PointRig, PoseColumns, PosedPoints, Views
+from .outline import MeshOutline, Outline, OutlinePoints, gaps, static_offset
+from .rig import FrameStack, Occlusion, PointRig, PoseColumns, PosedPoints, Projection, Views
+from .settings import FOCAL_SPREAD, USUAL_FOCAL
 
 
 class HeadState(NamedTuple):
@@ -27,6 +31,8 @@ class HeadState(NamedTuple):
     """(S,) identity coefficients."""
     poses: FloatArray
     """(T, D) columns of `PoseColumns`."""
+    zoom: float = 0.0
+    """Natural logarithm of the focal length relative to that of the fitter's cameras."""
 
 
 class HeadPrior(NamedTuple):
@@ -36,14 +42,22 @@ class HeadPrior(NamedTuple):
     """(D,) standard deviations around 0."""
     shape: FloatArray
     """(S,) the same."""
+    zoom: tuple[float, float] = (0.0, 0.0)
+    """Mean and standard deviation of `HeadState.zoom`."""
+
+
+def with_offset(head: HeadAsset, offset: FloatArray) -> HeadAsset:
+    """The head model with a static offset (V, 3) in its template."""
+    return replace(head, template=np.asarray(head.template + offset, head.template.dtype))
 
 
 class NormalEquations:
-    """Sums of ``J' A J`` and ``J' b`` over points, for T timesteps with D parameters each and S shared ones."""
+    """Sums of ``J' A J`` and ``J' b`` over points, for T timesteps with D parameters each and S + 1 shared ones: identity and focal
+    length. ``state``: Estimate with these sizes."""
 
-    def __init__(self, timesteps: int, pose_size: int, shape_size: int):
-        whole = pose_size + shape_size
-        self._split = pose_size
+    def __init__(self, state: HeadState):
+        timesteps, self._split = state.poses.shape
+        whole = self._split + len(state.shape) + 1
         self._matrices = np.zeros((timesteps, whole, whole))
         self._rights = np.zeros((timesteps, whole))
 
@@ -60,19 +74,26 @@ class NormalEquations:
         self._matrices[timestep] += flat.T @ bent.reshape(-1, width)
         self._rights[timestep] += flat.T @ slope.astype(jacobian.dtype).reshape(-1)
 
+    def add_residuals(
+        self, timestep: int, jacobian: FloatArray, weight: FloatArray, residual: FloatArray
+    ) -> None:
+        """Add residuals (n,) of a timestep with weights (n,) and derivatives (n, D + S) of the estimated values."""
+        weighted = jacobian * weight[:, None]
+        self._matrices[timestep] += jacobian.T @ weighted
+        self._rights[timestep] += weighted.T @ residual
+
     def step(self, state: HeadState, prior: HeadPrior, damping: float = 1e-6) -> HeadState:
         """The state after a step with the prior. ``damping``: Fraction of the diagonal that is added to it
         (Levenberg-Marquardt)."""
         split = self._split
-        deviations = np.concatenate([prior.pose, prior.shape])
+        deviations = np.concatenate([prior.pose, prior.shape, prior.zoom[1:]])
         free = deviations > 0
         with np.errstate(divide="ignore"):
             stiffness = np.where(free, 1 / deviations**2, 0.0)
         count = len(self._matrices)
-        values = np.concatenate(
-            [state.poses, np.broadcast_to(state.shape, (count, len(state.shape)))], axis=1
-        )
-        # The shape has one prior, divided among the timesteps.
+        shared = np.array([*state.shape, state.zoom - prior.zoom[0]])
+        values = np.concatenate([state.poses, np.broadcast_to(shared, (count, len(shared)))], axis=1)
+        # Shape and focal length have one prior, divided among the timesteps.
         stiffness[split:] /= count
         matrices = self._matrices * (free[:, None] & free)
         rights = (self._rights - stiffness * values) * free
@@ -81,18 +102,23 @@ class NormalEquations:
         matrices[:, diagonal, diagonal] += (
             stiffness + damping * matrices[:, diagonal, diagonal] + 1e-9 + ~free
         )
-        own, shared, corner = (
+        own, mixed, corner = (
             matrices[:, :split, :split],
             matrices[:, :split, split:],
             matrices[:, split:, split:],
         )
-        solved = np.linalg.solve(own, np.concatenate([rights[:, :split, None], shared], axis=2))
-        schur = corner.sum(axis=0) - np.einsum("tds,tdr->sr", shared, solved[:, :, 1:])
-        right = rights[:, split:].sum(axis=0) - np.einsum("tds,td->s", shared, solved[:, :, 0])
-        change = np.linalg.solve(schur, right) if len(right) else right
-        return HeadState(state.shape + change, state.poses + solved[:, :, 0] - solved[:, :, 1:] @ change)
+        solved = np.linalg.solve(own, np.concatenate([rights[:, :split, None], mixed], axis=2))
+        schur = corner.sum(axis=0) - np.einsum("tds,tdr->sr", mixed, solved[:, :, 1:])
+        right = rights[:, split:].sum(axis=0) - np.einsum("tds,td->s", mixed, solved[:, :, 0])
+        change = np.linalg.solve(schur, right)
+        # The depth follows the focal length exponentially; a step of a linear model must not be longer.
+        change[-1] = np.clip(change[-1], -MOST_ZOOM, MOST_ZOOM)
+        poses = state.poses + solved[:, :, 0] - solved[:, :, 1:] @ change
+        return HeadState(state.shape + change[:-1], poses, state.zoom + float(change[-1]))
 
 
+MOST_ZOOM = 0.1
+"""Largest change of the logarithm of the focal length in a step."""
 ANGLE_SPREAD = (np.inf,) * 3 + (0.15,) * 3 + (0.3, 0.03, 0.02) + (0.2, 0.3, 0.02) * 2
 """Standard deviations of the angles: rotation free, neck, jaw (which opens), eyes; radians."""
 LANDMARK_MM = 2.5
@@ -120,22 +146,30 @@ class BlurLevel(NamedTuple):
     steps: int
     tolerance: float
     """Squared difference of colours at which a weight is a quarter, relative to the usual one."""
+    landmarks: float
+    """Weight of a landmark beside the prior."""
 
 
 LEVELS = (
-    BlurLevel(5.0, 4, 64.0),
-    BlurLevel(2.5, 5, 32.0),
-    BlurLevel(1.2, 5, 16.0),
-    BlurLevel(0.7, 6, 4.0),
+    BlurLevel(5.0, 4, 64.0, 0.05),
+    BlurLevel(2.5, 5, 32.0, 0.03),
+    BlurLevel(1.2, 5, 16.0, 0.02),
+    BlurLevel(0.7, 6, 4.0, 0.01),
 )
-"""From coarse to fine. A narrow tolerance at coarse levels would reject the points that move most."""
+"""From coarse to fine. A narrow tolerance at coarse levels would reject the points that move most. All weights are small because
+errors of landmarks are correlated over time and those of points in space, so that sums over them overstate certainty."""
+COARSE = 2
+"""Number of levels before the static offset is estimated."""
 SHARPEST = 0.7
 """Minimum blur, pixels."""
 WIDE_MM = 6.0
 """Blur that is subtracted from the images."""
-LANDMARK_WEIGHT, COLOUR_WEIGHT = 0.005, 0.1
-"""Weights of a landmark and of a colour beside the prior. They are small because errors of landmarks are correlated over
-time and those of points in space, so that sums over them overstate certainty."""
+COLOUR_WEIGHT = 0.1
+"""Weight of a colour beside the prior."""
+EMPHASIS = (("eye_region", 4.0), ("lips", 10.0))
+"""Weights of landmarks of regions relative to others."""
+PAIR_MM, PAIR_WEIGHT = 1.0, 0.05
+"""Expected error of the difference between the landmarks of a pair, and its weight, as of a landmark."""
 SHAPE_SPREAD = 0.3
 """Standard deviation of the prior of the identity coefficients; less than 1 for the same reason."""
 
@@ -164,6 +198,24 @@ def sampled_vertices(head: HeadAsset) -> IntArray:
     return np.unique(np.concatenate(chosen))
 
 
+OUTLINE_MM, OUTLINE_ROBUST = 1.5, 4.0
+"""Expected error of a point of an outline, and the multiple of it at which its weight is a quarter."""
+OUTLINE_WEIGHT = 0.01
+"""Weight of a point of an outline, as of a landmark."""
+
+
+class OutlinedView(NamedTuple):
+    """Points of the mesh on its outline in an image."""
+
+    row: int
+    """Of the timestep."""
+    camera: int
+    points: OutlinePoints
+    rig: PointRig
+    normals: FloatArray
+    """(n, 2) outward, in the image."""
+
+
 class Fitted(NamedTuple):
     """Result of a fit."""
 
@@ -183,7 +235,10 @@ class Fitter:
     """C cameras."""
     landmarks: ImageLandmarks
     """Landmarks of T timesteps."""
-    landmark_weight: float = LANDMARK_WEIGHT
+    outlines: Sequence[Outline | None] = ()
+    """Outlines of the subject in the images of T x C frames; none without masks."""
+    zoom: tuple[float, float] = (0.0, 0.0)
+    """Prior of the focal length of one camera, as of `HeadPrior`; by default it is fixed."""
 
     def _prior(self, keep_shape: bool) -> HeadPrior:
         """Weak prior of all parameters."""
@@ -191,7 +246,23 @@ class Fitter:
         free = [np.inf] * 3
         coefficients = [1.0] * columns.expression_size + [0.5] * columns.eyelid_size
         shape = np.full(self.head.shape_basis.shape[2], 0.0 if keep_shape else SHAPE_SPREAD)
-        return HeadPrior(np.array([*ANGLE_SPREAD, *free, *coefficients]), shape)
+        zoom = (0.0, 0.0) if keep_shape else self.zoom
+        return HeadPrior(np.array([*ANGLE_SPREAD, *free, *coefficients]), shape, zoom)
+
+    def views_of(self, state: HeadState) -> Views:
+        """The cameras with the estimated focal length."""
+        return self.views.zoomed(state.zoom) if state.zoom else self.views
+
+    def _linearised(self, rig: PointRig, state: HeadState, row: int) -> PosedPoints:
+        """Points of a timestep, with their derivatives by shape and zoom together."""
+        posed = rig.linearised(state.shape, state.poses[row])
+        by_zoom = np.zeros_like(posed.points)
+        if self.zoom[1]:
+            # A longer focal length moves pixels like points that are farther from the axis of the camera.
+            turn, shift = self.views.rotations[0], self.views.shifts[0]
+            aside = (posed.points @ turn.T + shift) * [1, 1, 0]
+            by_zoom = (aside @ turn).astype(by_zoom.dtype)
+        return posed._replace(by_shape=np.concatenate([posed.by_shape, by_zoom[..., None]], axis=2))
 
     def start(self, shape: FloatArray | None = None) -> HeadState:
         """A shape, by default the mean, in the rigid pose of the landmarks of one camera at each timestep. Of the
@@ -231,38 +302,77 @@ class Fitter:
         return PointRig(self.head, self.landmarks.corners, self.landmarks.weights)
 
     def add_landmarks(
-        self, equations: NormalEquations, rig: PointRig, state: HeadState, leave_out: bool = True
+        self, equations: NormalEquations, rig: PointRig, state: HeadState, weight: float, leave_out: bool = True
     ) -> FloatArray:
-        """Add the landmarks to the equations; return their root mean square distance at each timestep, (T,) pixels;
+        """Add the landmarks to the equations with a weight; return their root mean square distance at each timestep, (T,) pixels;
         0 where none is used."""
-        distance = np.zeros(len(state.poses))
+        distance, views = np.zeros(len(state.poses)), self.views_of(state)
+        emphasis = self._emphasis()
         for row, pixels in enumerate(self.landmarks.pixels):
-            posed = rig.linearised(state.shape, state.poses[row])
-            projected = self.views.project(posed.points)
+            posed = self._linearised(rig, state, row)
+            projected = views.project(posed.points)
             seen = np.isfinite(pixels[..., 0])
             gap = np.where(seen[..., None], pixels - projected.pixels, 0.0)
-            per_metre = self.views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
+            per_metre = views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
             sigma = 1e-3 * LANDMARK_MM * per_metre
             square = (gap**2).sum(axis=2)
             # All landmarks of an image may be wrong if the network detects something else as a face.
             if leave_out:
                 near = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
                 seen &= ((seen & near).sum(axis=1) > seen.sum(axis=1) / 2)[:, None]
-            robust = seen * self.landmark_weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
+            robust = seen * emphasis * weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
             distance[row] = np.sqrt((seen * square).sum() / max(seen.sum(), 1))
             weighted = robust[..., None, None] * projected.derivative
             curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
             slope = np.einsum("cpki,cpk->pi", weighted, gap)
             equations.add(row, posed, curvature, slope)
+            self._add_pairs(equations, row, posed, projected, gap * seen[..., None], sigma, seen)
         return distance
 
-    def fit_landmarks(self, state: HeadState, *, keep_shape: bool = False) -> HeadState:
+    def _emphasis(self) -> FloatArray:
+        """(L,) weights of landmarks relative to one another."""
+        weights = np.ones(len(self.landmarks.corners))
+        for name, weight in EMPHASIS:
+            members = np.isin(self.landmarks.corners, np.asarray(self.head.regions.get(name, ()), np.int64))
+            weights[members.any(axis=1)] = weight
+        return weights
+
+    def _add_pairs(
+        self,
+        equations: NormalEquations,
+        row: int,
+        posed: PosedPoints,
+        projected: Projection,
+        gap: FloatArray,
+        sigma: FloatArray,
+        seen: BoolArray,
+    ) -> None:
+        """Add the differences between the landmarks of pairs."""
+        one, other = self.landmarks.pairs.T
+        jacobian = np.concatenate([posed.by_pose, posed.by_shape], axis=2)
+        for camera in range(len(seen)):
+            kept = np.flatnonzero(seen[camera, one] & seen[camera, other])
+            if not len(kept):
+                continue
+            a, b = one[kept], other[kept]
+            by_pixel = projected.derivative[camera]
+            rows = by_pixel[a] @ jacobian[a] - by_pixel[b] @ jacobian[b]  # (n, 2, D + S)
+            residual = gap[camera, a] - gap[camera, b]
+            scale = sigma[camera, a] * PAIR_MM / LANDMARK_MM
+            square = (residual**2).sum(axis=1)
+            weight = PAIR_WEIGHT / (scale * (1 + square / (ROBUST * scale) ** 2)) ** 2
+            width = rows.shape[2]
+            equations.add_residuals(row, rows.reshape(-1, width), np.repeat(weight, 2), residual.ravel())
+
+    def fit_landmarks(
+        self, state: HeadState, *, keep_shape: bool = False, weight: float = LEVELS[0].landmarks
+    ) -> HeadState:
         """Steps on the landmarks alone, the first of the rigid pose only."""
         rig, prior = self.landmark_rig(), self._prior(keep_shape)
         still = HeadPrior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
         for step in range(_RIGID + _STEPS):
-            equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
-            self.add_landmarks(equations, rig, state, leave_out=step >= _RIGID)
+            equations = NormalEquations(state)
+            self.add_landmarks(equations, rig, state, weight, leave_out=step >= _RIGID)
             state = equations.step(state, still if step < _RIGID else prior, 1e-3)
         return state
 
@@ -271,37 +381,101 @@ class Fitter:
         state: HeadState,
         stack: FrameStack,
         *,
+        levels: Sequence[BlurLevel] = LEVELS,
         keep_shape: bool = False,
+        scalp: bool = True,
         progress: Progress = no_progress,
     ) -> Fitted:
-        """Steps on colours of points and landmarks at the blurs of `LEVELS`, with or without optimising the shape.
-        ``stack`` holds the images of all timesteps, the cameras of each together."""
+        """Steps on colours of points, landmarks and outlines at the blurs of ``levels``, with or without optimising the
+        shape. ``scalp``: Whether the outline of the scalp counts, which the static offset moves to that of the hair. ``stack`` holds the images of all timesteps, the cameras of each together."""
         vertices = sampled_vertices(self.head)
         rig = PointRig.at_vertices(self.head, vertices)
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
         marks, prior = self.landmark_rig(), self._prior(keep_shape)
         scale = self._pixels_per_millimetre(mesh, state)
-        total, done = sum(level.steps for level in LEVELS), 0
+        total, done = sum(level.steps for level in levels), 0
         landmarks = colours = cast(FloatArray, np.zeros(len(state.poses)))
-        for level in LEVELS:
+        for level in levels:
             stack.filter(max(SHARPEST, level.blur * scale), WIDE_MM * scale)
             samples = self._observations(state, mesh, vertices)
+            outlined = self._outlined(state, mesh, scalp)
             for _ in range(level.steps):
                 progress(done, total, f"blur of {level.blur:g} mm")
-                equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
-                landmarks = self.add_landmarks(equations, marks, state)
+                equations = NormalEquations(state)
+                landmarks = self.add_landmarks(equations, marks, state, level.landmarks)
                 colours = self._add_colours(equations, rig, state, stack, samples, level.tolerance)
+                self._add_outlines(equations, state, outlined)
                 state = equations.step(state, prior)
                 done += 1
         return Fitted(state, landmarks, colours)
 
+    def _outlined(self, state: HeadState, mesh: PointRig, scalp: bool) -> list[OutlinedView]:
+        """The outlines of the posed meshes."""
+        if not any(self.outlines):
+            return []
+        views = self.views_of(state)
+        finder = MeshOutline(self.head, mesh.points(state.shape, state.poses[0]), views, scalp)
+        faces, result = np.asarray(self.head.faces), []
+        for row, pose in enumerate(state.poses):
+            posed = mesh.points(state.shape, pose).astype(np.float64)
+            normals = vertex_normals(posed, faces)
+            for camera, points in enumerate(finder.points(posed)):
+                if not len(points.corners):
+                    continue
+                mixed = np.einsum("nk,nki->ni", points.weights, normals[points.corners])
+                outward = (mixed @ views.rotations[camera].T)[:, :2]
+                outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+                result.append(OutlinedView(row, camera, points, mesh.mixed(*points), outward))
+        return result
+
+    def _add_outlines(self, equations: NormalEquations, state: HeadState, outlined: Sequence[OutlinedView]) -> None:
+        """Add the distances between both outlines to the equations."""
+        cameras = self.views_of(state)
+        for view in outlined:
+            outline = self.outlines[view.row * len(cameras.cameras) + view.camera]
+            if outline is None:
+                continue
+            posed = self._linearised(view.rig, state, view.row)
+            projected = cameras.project(posed.points, np.full(len(posed.points), view.camera))
+            found = gaps(outline, projected.pixels, view.normals)
+            sigma = 1e-3 * OUTLINE_MM * cameras.intrinsics[view.camera, 0, 0] / projected.depth
+            robust = found.aligned * OUTLINE_WEIGHT
+            robust /= (sigma * (1 + (found.distance / (OUTLINE_ROBUST * sigma)) ** 2)) ** 2
+            along = np.einsum("ni,nik->nk", found.normals, projected.derivative)
+            curvature = robust[:, None, None] * along[:, :, None] * along[:, None]
+            equations.add(view.row, posed, curvature, (robust * found.distance)[:, None] * along)
+
+    def fit_offset(self, state: HeadState) -> FloatArray:
+        """(V, 3) static offset, metres, that moves the outline of the mesh to those of the masks."""
+        mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
+        views, parts, distances = self.views_of(state), [], []
+        for view in self._outlined(state, mesh, True):
+            outline = self.outlines[view.row * len(views.cameras) + view.camera]
+            if outline is None:
+                continue
+            projected = views.project(
+                view.rig.points(state.shape, state.poses[view.row]), np.full(len(view.normals), view.camera)
+            )
+            found = gaps(outline, projected.pixels, view.normals)
+            kept = found.aligned > 0
+            metres = found.distance * projected.depth / views.intrinsics[view.camera, 0, 0]
+            parts.append(OutlinePoints(view.points.corners[kept], view.points.weights[kept]))
+            distances.append(metres[kept])
+        if not parts:
+            return np.zeros(np.shape(self.head.template))
+        neutral = np.asarray(self.head.template + self.head.shape_basis @ state.shape, np.float64)
+        points = OutlinePoints(*map(np.concatenate, zip(*parts)))
+        return static_offset(self.head, neutral, points, np.concatenate(distances))
+
     def _pixels_per_millimetre(self, mesh: PointRig, state: HeadState) -> float:
-        depth = self.views.place(mesh.points(state.shape, state.poses[0]))[1]
-        return float(np.median(1e-3 * self.views.intrinsics[:, 0, 0] / np.median(depth, axis=1)))
+        views = self.views_of(state)
+        depth = views.place(mesh.points(state.shape, state.poses[0]))[1]
+        return float(np.median(1e-3 * views.intrinsics[:, 0, 0] / np.median(depth, axis=1)))
 
     def _observations(self, state: HeadState, mesh: PointRig, vertices: IntArray) -> Observations:
         """The vertices that each frame sees."""
-        occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), self.views)
+        views = self.views_of(state)
+        occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), views)
         frames, points, weights = [], [], []
         for row, pose in enumerate(state.poses):
             cosine = occlusion.visible(mesh.points(state.shape, pose).astype(np.float64), vertices)
@@ -321,13 +495,14 @@ class Fitter:
         tolerance: float,
     ) -> FloatArray:
         """Add the colours to the equations; return their median difference at each timestep, (T,) 8-bit levels."""
-        cameras = len(self.views.cameras)
+        views = self.views_of(state)
+        cameras = len(views.cameras)
         bounds = np.searchsorted(samples.frame, np.arange(len(state.poses) + 1) * cameras)
         posed = [rig.points(state.shape, pose) for pose in state.poses]
         sampled = []
         for row, (start, end) in enumerate(pairwise(bounds)):
             frame, point = samples.frame[start:end], samples.point[start:end]
-            projected = self.views.project(posed[row][point], frame - row * cameras)
+            projected = views.project(posed[row][point], frame - row * cameras)
             values, gradients = stack.sample(frame, projected.pixels)
             sampled.append((values, gradients @ projected.derivative.astype(np.float32)))
         values = np.concatenate([part[0] for part in sampled])
@@ -343,7 +518,7 @@ class Fitter:
             count = end - start
             entries = (np.ones(count, np.float32), (samples.point[start:end], np.arange(count)))
             gather = csr_array(entries, shape=(len(posed[0]), count))
-            linearised = rig.linearised(state.shape, state.poses[row])
+            linearised = self._linearised(rig, state, row)
             equations.add(row, linearised, (gather @ curvature).reshape(-1, 3, 3), gather @ slope)
             difference[row] = 255 * np.median(np.abs(gap)) if count else 0.0
         return difference
@@ -367,13 +542,13 @@ def _texture(
     return texture.astype(np.float32), (3 * robust / scale).astype(np.float32)
 
 
-TRIED = tuple(np.geomspace(0.8, 5.0, 9))
+TRIED = tuple(np.geomspace(0.8, 6.0, 10))
 """Focal lengths relative to the longer side of the picture."""
 FRAMES = 16
 WEIGHT = 1.0
 """Weight of a landmark relative to the prior. With that of tracking, residuals due to the prior would hide perspective."""
-CLEAR = 1.02
-"""Minimum ratio of the residuals at both ends of `TRIED` to the smallest one for a determined focal length."""
+INDEPENDENT = 50
+"""Number of independent residuals that all landmarks are worth, since their errors are correlated."""
 
 
 class FocalLength(NamedTuple):
@@ -385,15 +560,9 @@ class FocalLength(NamedTuple):
     tried: FloatArray
     """(N,) pixels."""
 
-    @property
-    def clear(self) -> bool:
-        """Whether the landmarks determine the focal length."""
-        best = int(self.residuals.argmin())
-        return 0 < best < len(self.tried) - 1 and self.residuals[[0, -1]].min() > CLEAR * self.residuals[best]
-
 
 def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, side: float) -> FocalLength:
-    """The focal length at which the head model fits landmarks of one camera best.
+    """The most probable focal length of one camera by landmarks of a head model and the prior of `USUAL_FOCAL`.
 
     Shape, poses and expressions are fitted for each tried length; between them the minimum of a parabola in its logarithm is
     taken. Landmarks have systematic errors of some millimetres, and a near face with a short lens looks like a longer face, so that
@@ -406,10 +575,11 @@ def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, s
     sample = sample.of(np.unique(np.linspace(0, len(sample.pixels) - 1, FRAMES).astype(int)))
     tried = side * np.array(TRIED)
     residuals = np.array([_residual(head, camera, sample, focal) for focal in tried])
-    best = int(residuals.argmin())
+    improbable = INDEPENDENT * np.log(residuals) + (np.log(TRIED) - np.log(USUAL_FOCAL)) ** 2 / (2 * FOCAL_SPREAD**2)
+    best = int(improbable.argmin())
     pixels = tried[best]
     if 0 < best < len(tried) - 1:
-        below, least, above = residuals[best - 1 : best + 2]
+        below, least, above = improbable[best - 1 : best + 2]
         step = 0.5 * (below - above) / (below - 2 * least + above)
         pixels = tried[best] * (tried[best + 1] / tried[best]) ** step
     return FocalLength(float(pixels), residuals, tried)
@@ -419,8 +589,8 @@ def _residual(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, focal:
     K = np.array(camera.K, np.float64)
     K[0, 0] = K[1, 1] = focal
     views = Views([Camera(camera.id, camera.width, camera.height, K, camera.world_to_camera)])
-    fitter = Fitter(head, views, landmarks, WEIGHT)
-    state = fitter.fit_landmarks(fitter.start())
-    equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
-    distances = fitter.add_landmarks(equations, fitter.landmark_rig(), state)
+    fitter = Fitter(head, views, landmarks)
+    state = fitter.fit_landmarks(fitter.start(), weight=WEIGHT)
+    equations = NormalEquations(state)
+    distances = fitter.add_landmarks(equations, fitter.landmark_rig(), state, WEIGHT)
     return float(np.sqrt(np.mean(distances**2)))

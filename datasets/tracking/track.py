@@ -27,8 +27,9 @@ from ..ga.writer import save_npz
 from ..head.geometry import fit_sphere
 from ..head.model import PosedSubject
 from ..open import open_clip
-from .fit import Fitter, HeadState
+from .fit import COARSE, LEVELS, Fitter, HeadState, with_offset
 from .landmarks import ImageLandmarks, landmark_source
+from .outline import outline_of
 from .rig import FrameStack, PoseColumns, Views, outliers
 from .settings import TRACKER_VERSION
 
@@ -109,6 +110,8 @@ def mesh_errors(found: FloatArray, wanted: FloatArray, turns: FloatArray) -> Reg
     return RegionError(spread(gaps), spread(np.stack(mapped)), spread(local - local.mean(axis=0)))
 
 
+FIXED_FOCAL = (0.0, 0.0)
+"""Prior of a focal length that is not estimated."""
 LEAST_TRACKED = 0.5
 """Minimum fraction of timesteps that must be tracked."""
 MOST_TIMESTEPS, MOST_PIXELS = 64, 2.5e8
@@ -188,6 +191,7 @@ def track(
     *,
     notes: Mapping[str, Any] | None = None,
     store: Path | None = None,
+    zoom: tuple[float, float] = FIXED_FOCAL,
     progress: Progress = no_progress,
 ) -> Tracked:
     """Estimate shape and poses from images; recorded as a step. The static offset becomes zero.
@@ -195,7 +199,8 @@ def track(
     Timesteps without landmarks, and those whose fit remains an outlier, are not in the clip that is returned.
 
     Neither shape, poses nor static offset of the clip are used, other than by ``source``. The shape is estimated with the
-    first timesteps, spread over the clip, and kept for the others.
+    first timesteps, spread over the clip, and kept for the others. So is the focal length of a single camera, if ``zoom``,
+    mean and standard deviation of the logarithm of its change, is given.
 
     ``cameras``: Cameras whose images are used; one is enough. ``source``: Finds landmarks. ``notes``: Recorded with the
     step. ``store``: Folder that keeps the fit of every part, which a later call with the same images and landmarks does not
@@ -214,7 +219,7 @@ def track(
     views = Views([clip.cameras[name] for name in cameras])
     most = min(MOST_TIMESTEPS, max(1, int(MOST_PIXELS // views.sizes.prod(axis=1).sum())))
     blocks = -(-len(timesteps) // most)
-    fits = _Fits(clip, [*cameras], views, store)
+    fits = _Fits(clip, [*cameras], views, store, zoom)
     pixels: dict[int, FloatArray] = {}
     for block in range(blocks):
         landmarks = source(chosen := timesteps[block::blocks])
@@ -261,8 +266,9 @@ def track(
         "track",
         parameters,
         shape=state.shape,
-        static_offset=np.zeros(np.shape(clip.head.template), np.float32),
+        static_offset=np.asarray(fits.offset, np.float32),
         poses=dict(zip(kept, tracked)),
+        cameras={**clip.cameras, **{one.id: one for one in fits.views.cameras}},
     )
     return Tracked(derived, report)
 
@@ -291,7 +297,9 @@ class _Fits:
     cameras: list[str]
     views: Views
     store: Path | None
+    zoom: tuple[float, float]
     shape: FloatArray | None = None
+    offset: FloatArray | None = None
     seconds: float = 0.0
     poses: dict[int, FloatArray] = field(default_factory=dict)
     """(D,) each."""
@@ -302,16 +310,19 @@ class _Fits:
     ) -> None:
         """Fit timesteps, from their poses if there are any, and take the results of some of them."""
         start = np.stack([self.poses[timestep] for timestep in part]) if part[0] in self.poses else None
-        given = self.clip, self.cameras, self.views, part, landmarks, self.shape, start, progress
+        given = self.clip, self.cameras, self.views, part, landmarks, self.shape, self.offset, start, self.zoom, progress
         if self.store is None:
             fitted = _fit_block(*given)
         else:
             seen = [[one.id, one.width, one.height, one.K, one.world_to_camera] for one in self.views.cameras]
             heads = self.clip.fingerprint, self.clip.head.fingerprint()
-            mark = digest(TRACKER_VERSION, *heads, seen, part, *landmarks, self.shape, start)
+            mark = digest(TRACKER_VERSION, *heads, seen, part, *landmarks, self.shape, self.offset, start, self.zoom)
             file = self.store / f"{name}.npz"
             fitted = cached_arrays(file, mark, _PART, lambda: _fit_block(*given), {"T": len(part)})
-        self.shape = fitted["shape"]
+        self.shape, self.offset = fitted["shape"], fitted["offset"]
+        if fitted["zoom"]:
+            self.views = self.views.zoomed(float(fitted["zoom"]))
+        self.zoom = FIXED_FOCAL
         self.seconds += float(fitted["seconds"])
         rows = zip(part, fitted["poses"], fitted["landmarks"].tolist(), fitted["colours"].tolist())
         for timestep, pose, *residual in rows:
@@ -329,6 +340,8 @@ class _Fits:
 
 _PART = {
     "shape": Member("f", ("S",)),
+    "offset": Member("f", ("V", 3)),
+    "zoom": Member("f", ()),
     "poses": Member("f", ("T", "D")),
     **dict.fromkeys(("landmarks", "colours"), Member("f", ("T",))),
     "seconds": Member("f", ()),
@@ -342,19 +355,35 @@ def _fit_block(
     part: Sequence[int],
     landmarks: ImageLandmarks,
     shape: FloatArray | None,
+    offset: FloatArray | None,
     poses: FloatArray | None,
+    zoom: tuple[float, float],
     progress: Progress,
 ) -> dict[str, np.ndarray]:
     """Fit some timesteps with a given or a newly estimated shape, from given poses or from those of the landmarks.
     Returns the arrays of `_PART`."""
     begin = time.perf_counter()
-    fitter = Fitter(clip.head, views, landmarks)
+    keys = [clip.frame_at[timestep, name] for timestep in part for name in cameras]
+    masks = [clip.mask(key) for key in keys]
+    outlines = [None if mask is None else outline_of(mask) for mask in masks]
+    head = clip.head if offset is None else with_offset(clip.head, offset)
+    fitter = Fitter(head, views, landmarks, outlines=outlines, zoom=zoom)
     images = [clip.image(clip.frame_at[timestep, name]) for timestep in part for name in cameras]
     keep = shape is not None
     state = fitter.start(shape) if shape is None or poses is None else HeadState(shape, poses)
     state = fitter.fit_landmarks(state, keep_shape=keep)
-    fitted = fitter.fit_colours(state, FrameStack(images), keep_shape=keep, progress=progress)
+    stack = FrameStack(images)
+    if offset is None:
+        fitted = fitter.fit_colours(state, stack, levels=LEVELS[:COARSE], scalp=False, progress=progress)
+        offset = fitter.fit_offset(fitted.state)
+        fitter, state = replace(fitter, head=with_offset(clip.head, offset)), fitted.state
+        fitted = fitter.fit_colours(state, stack, levels=LEVELS[COARSE:], progress=progress)
+        offset = offset + fitter.fit_offset(fitted.state)
+    else:
+        fitted = fitter.fit_colours(state, stack, keep_shape=True, progress=progress)
     return {
+        "offset": offset,
+        "zoom": np.array(fitted.state.zoom),
         "shape": fitted.state.shape,
         "poses": fitted.state.poses,
         "landmarks": fitted.landmarks,

@@ -19,8 +19,9 @@ from ..clip import CaptureClip
 from ..head.refit.command import target_head
 from ..tracking.fit import FocalLength, estimate_focal
 from ..tracking.landmarks import Embedding, NetworkLandmarks, head_embedding
-from ..tracking.settings import TRACKER_VERSION, make_work_folder
-from .clip import USUAL_FOCAL, FrameView, VideoClip, open_video
+from ..tracking.settings import FOCAL_SPREAD, TRACKER_VERSION, USUAL_FOCAL, make_work_folder
+from ..tracking.track import FIXED_FOCAL
+from .clip import FrameView, VideoClip, open_video
 from .faces import LEAST_SEEN, REMEDY, FaceFinder
 
 if TYPE_CHECKING:
@@ -41,6 +42,8 @@ class OpenedVideo(NamedTuple):
     """Name of the file of the landmark network."""
     numbers: list[int]
     """Numbers in the file of the frames of the clip."""
+    zoom: tuple[float, float]
+    """Prior of the focal length, as `tracking.fit.HeadPrior.zoom`."""
     data: dict[str, Any]
     lines: list[str]
 
@@ -68,7 +71,7 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
             lambda: head_embedding(finder.network, head, teacher, progress)._asdict(),
         )
     )
-    clip, focal = video.clip, None
+    clip, zoom = video.clip, FIXED_FOCAL
     landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
     detected = landmarks(sorted(clip.poses))
     if (count := int(detected.seen.sum())) < LEAST_SEEN * len(detected.seen):
@@ -87,17 +90,18 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
             },
         )
         focal = FocalLength(float(stored["pixels"]), stored["residuals"], stored["tried"])
-        if focal.clear:
-            clip = video.with_focal(focal.pixels / video.view.scale)
-            landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
+        clip = video.with_focal(focal.pixels / video.view.scale)
+        landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
+        zoom = float(np.log(USUAL_FOCAL * side / focal.pixels)), FOCAL_SPREAD
     return OpenedVideo(
         clip,
         video.view,
         landmarks,
         network.name,
         video.faces.numbers[video.faces.found].tolist(),
-        _data(video, settings.focal, focal),
-        _lines(video, settings.focal, focal),
+        zoom,
+        _data(video),
+        _lines(video),
     )
 
 
@@ -109,7 +113,7 @@ def _embedding_arrays(head: HeadAsset) -> dict[str, Member]:
     }
 
 
-def _data(video: VideoClip, given: float | None, focal: FocalLength | None) -> dict[str, Any]:
+def _data(video: VideoClip) -> dict[str, Any]:
     return {
         "video": {
             **video.info._asdict(),
@@ -119,28 +123,26 @@ def _data(video: VideoClip, given: float | None, focal: FocalLength | None) -> d
             "found_again": [one._asdict() for one in video.faces.again],
             "other_faces": video.faces.numbers[video.faces.others > 0].tolist(),
             **({"unsure": [*video.unsure]} if video.unsure else {}),
-            "focal": dict(zip(("pixels", "source"), _focal(video, given, focal))),
         }
     }
 
 
-def _focal(video: VideoClip, given: float | None, focal: FocalLength | None) -> tuple[float, str]:
-    """Focal length in pixels of the video, and its source."""
-    if focal is None:
-        return given or 0.0, "given"
-    if focal.clear:
-        return focal.pixels / video.view.scale, "estimated from landmarks"
-    usual = USUAL_FOCAL * max(video.info.width, video.info.height)
-    return usual, "assumed, since the landmarks do not determine it; give --focal if you know it"
+def with_focal(video: OpenedVideo, clip: CaptureClip) -> OpenedVideo:
+    """The information with the focal length of the tracked clip."""
+    (camera,) = clip.cameras.values()
+    pixels = float(camera.K[0, 0]) / video.view.scale
+    source = "estimated" if video.zoom[1] else "given"
+    relative = pixels / max(video.data["video"]["width"], video.data["video"]["height"])
+    line = f"  focal      {pixels:.0f} pixels of the video, {relative:.2f} times its longer side, {source}"
+    found = {**video.data["video"], "focal": {"pixels": pixels, "source": source}}
+    return video._replace(data={"video": found}, lines=[*video.lines, line])
 
 
-def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> list[str]:
+def _lines(video: VideoClip) -> list[str]:
     (camera,) = video.clip.cameras.values()
-    pixels, source = _focal(video, given, focal)
     lines = [
         f"{len(video.clip.files)} frames of {camera.width}x{camera.height} pixels around the head",
         f"  video      {video.info.width}x{video.info.height} pixels, {video.info.rate:.3g} frames a second",
-        f"  focal      {pixels:.0f} pixels of the video, {source}",
     ]
     faces = video.faces
     if video.without_face:
