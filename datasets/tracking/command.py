@@ -47,11 +47,11 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from ..images import write_image
     from ..inspect.figure import draw_overlay
     from ..steps.masks import label_files, without_torso
-    from ..video.command import video_to_track, with_focal
+    from ..video.command import video_to_track
     from ..video.decode import is_video
     from .landmarks import landmark_source
     from .programs import track_with_program
-    from .track import FIXED_FOCAL, LandmarkSource, check_cameras, track, tracking_errors
+    from .track import LandmarkSource, check_cameras, track, tracking_errors
 
     if settings.fetch_networks:
         files = fetch_networks()
@@ -88,10 +88,16 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
             clip, cameras, settings.landmarks, teacher, seed=settings.seed, progress=progress
         )
     make_work_folder(work)
-    zoom = video.zoom if video else FIXED_FOCAL
-    tracked = track(clip, cameras, source, notes=notes, store=work, zoom=zoom, progress=progress)
+    tracked = track(
+        clip,
+        cameras,
+        source,
+        notes=notes,
+        store=work,
+        seconds=video.seconds if video else 0.0,
+        progress=progress,
+    )
     if video is not None:
-        video = with_focal(video, tracked.clip)
         tracked = tracked._replace(
             clip=without_torso(tracked.clip, settings.cut, settings.parsing, video.view.image)
         )

@@ -13,10 +13,12 @@ from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
+from scipy.linalg import solveh_banded
 from scipy.sparse import csr_array
 
 from ...bench.contracts import BoolArray, Camera, FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError
+from ..head.arrays import HeadArrays
 from ..head.geometry import vertex_normals
 from .landmarks import ImageLandmarks, spread_vertices
 from .outline import MeshOutline, Outline, OutlinePoints, gaps, static_offset
@@ -31,8 +33,6 @@ class HeadState(NamedTuple):
     """(S,) identity coefficients."""
     poses: FloatArray
     """(T, D) columns of `PoseColumns`."""
-    zoom: float = 0.0
-    """Natural logarithm of the focal length relative to that of the fitter's cameras."""
 
 
 class HeadPrior(NamedTuple):
@@ -42,24 +42,22 @@ class HeadPrior(NamedTuple):
     """(D,) standard deviations around 0."""
     shape: FloatArray
     """(S,) the same."""
-    zoom: tuple[float, float] = (0.0, 0.0)
-    """Mean and standard deviation of `HeadState.zoom`."""
 
 
-def with_offset(head: HeadAsset, offset: FloatArray) -> HeadAsset:
+def with_offset(head: HeadArrays, offset: FloatArray) -> HeadArrays:
     """The head model with a static offset (V, 3) in its template."""
     return replace(head, template=np.asarray(head.template + offset, head.template.dtype))
 
 
 class NormalEquations:
-    """Sums of ``J' A J`` and ``J' b`` over points, for T timesteps with D parameters each and S + 1 shared ones: identity and focal
-    length. ``state``: Estimate with these sizes."""
+    """Sums of ``J' A J`` and ``J' b`` over points, for T timesteps with D parameters each and S shared ones. ``state``: Estimate with these sizes."""
 
     def __init__(self, state: HeadState):
         timesteps, self._split = state.poses.shape
-        whole = self._split + len(state.shape) + 1
+        whole = self._split + len(state.shape)
         self._matrices = np.zeros((timesteps, whole, whole))
         self._rights = np.zeros((timesteps, whole))
+        self._links: FloatArray | None = None
 
     def add(self, timestep: int, posed: PosedPoints, curvature: FloatArray, slope: FloatArray) -> None:
         """Add the points of a timestep.
@@ -82,18 +80,30 @@ class NormalEquations:
         self._matrices[timestep] += jacobian.T @ weighted
         self._rights[timestep] += weighted.T @ residual
 
+    def link(self, poses: FloatArray, deviations: FloatArray) -> None:
+        """Expect consecutive poses (T, D) to differ by standard deviations (T - 1, D); infinity for none."""
+        stiffness = deviations**-2.0
+        pull = stiffness * np.diff(poses, axis=0)
+        pose = np.arange(self._split)
+        self._links = stiffness
+        self._matrices[:-1, pose, pose] += stiffness
+        self._matrices[1:, pose, pose] += stiffness
+        self._rights[:-1, pose] += pull
+        self._rights[1:, pose] -= pull
+
     def step(self, state: HeadState, prior: HeadPrior, damping: float = 1e-6) -> HeadState:
         """The state after a step with the prior. ``damping``: Fraction of the diagonal that is added to it
         (Levenberg-Marquardt)."""
         split = self._split
-        deviations = np.concatenate([prior.pose, prior.shape, prior.zoom[1:]])
+        deviations = np.concatenate([prior.pose, prior.shape])
         free = deviations > 0
         with np.errstate(divide="ignore"):
             stiffness = np.where(free, 1 / deviations**2, 0.0)
         count = len(self._matrices)
-        shared = np.array([*state.shape, state.zoom - prior.zoom[0]])
-        values = np.concatenate([state.poses, np.broadcast_to(shared, (count, len(shared)))], axis=1)
-        # Shape and focal length have one prior, divided among the timesteps.
+        values = np.concatenate(
+            [state.poses, np.broadcast_to(state.shape, (count, len(state.shape)))], axis=1
+        )
+        # The shape has one prior, divided among the timesteps.
         stiffness[split:] /= count
         matrices = self._matrices * (free[:, None] & free)
         rights = (self._rights - stiffness * values) * free
@@ -102,6 +112,8 @@ class NormalEquations:
         matrices[:, diagonal, diagonal] += (
             stiffness + damping * matrices[:, diagonal, diagonal] + 1e-9 + ~free
         )
+        if self._links is not None:  # the shape is fixed
+            return state._replace(poses=state.poses + _chain(matrices, rights[:, :split], self._links))
         own, mixed, corner = (
             matrices[:, :split, :split],
             matrices[:, :split, split:],
@@ -110,15 +122,41 @@ class NormalEquations:
         solved = np.linalg.solve(own, np.concatenate([rights[:, :split, None], mixed], axis=2))
         schur = corner.sum(axis=0) - np.einsum("tds,tdr->sr", mixed, solved[:, :, 1:])
         right = rights[:, split:].sum(axis=0) - np.einsum("tds,td->s", mixed, solved[:, :, 0])
-        change = np.linalg.solve(schur, right)
-        # The depth follows the focal length exponentially; a step of a linear model must not be longer.
-        change[-1] = np.clip(change[-1], -MOST_ZOOM, MOST_ZOOM)
-        poses = state.poses + solved[:, :, 0] - solved[:, :, 1:] @ change
-        return HeadState(state.shape + change[:-1], poses, state.zoom + float(change[-1]))
+        change = np.linalg.solve(schur, right) if len(right) else right
+        return HeadState(state.shape + change, state.poses + solved[:, :, 0] - solved[:, :, 1:] @ change)
 
 
-MOST_ZOOM = 0.1
-"""Largest change of the logarithm of the focal length in a step."""
+def _chain(matrices: FloatArray, rights: FloatArray, links: FloatArray) -> FloatArray:
+    """(T, D) solution of systems of which each is linked with the next one. ``matrices``: (T, D or more, the same), symmetric.
+    ``links``: (T - 1, D) negative derivatives between the same parameters of consecutive timesteps."""
+    count, size = rights.shape
+    bands = np.zeros((size + 1, count * size))
+    for below in range(size):
+        diagonal = np.diagonal(matrices[:, :size, :size], -below, 1, 2)  # (T, size - below)
+        bands[below].reshape(count, size)[:, : size - below] = diagonal
+    bands[size, : (count - 1) * size] = -links.ravel()
+    return np.asarray(solveh_banded(bands, rights.ravel(), lower=True)).reshape(count, size)
+
+
+def continuous(poses: FloatArray) -> FloatArray:
+    """Poses (T, D) whose rotation vectors (the first three columns) differ least from those of the timestep before. A head that
+    faces a camera is turned by about half a turn, where there are two vectors for about the same rotation."""
+    result = poses.copy()
+    for before, after in pairwise(result):
+        angle = max(float(np.linalg.norm(after[:3])), 1e-9)
+        other = after[:3] * (1 - 2 * np.pi / angle)
+        if np.linalg.norm(other - before[:3]) < np.linalg.norm(after[:3] - before[:3]):
+            after[:3] = other
+    return result
+
+
+def motion_spread(timesteps: Sequence[int], seconds: float, size: int) -> FloatArray:
+    """(T - 1, D) standard deviations of the differences between poses of consecutive timesteps, ``seconds`` apart."""
+    angles, translation, coefficient = SPEED
+    usual = np.array([*angles, *(translation,) * 3, *(coefficient,) * (size - len(angles) - 3)])
+    return np.asarray(seconds * np.diff(timesteps)[:, None] * usual)
+
+
 ANGLE_SPREAD = (np.inf,) * 3 + (0.15,) * 3 + (0.3, 0.03, 0.02) + (0.2, 0.3, 0.02) * 2
 """Standard deviations of the angles: rotation free, neck, jaw (which opens), eyes; radians."""
 LANDMARK_MM = 2.5
@@ -158,6 +196,10 @@ LEVELS = (
 )
 """From coarse to fine. A narrow tolerance at coarse levels would reject the points that move most. All weights are small because
 errors of landmarks are correlated over time and those of points in space, so that sums over them overstate certainty."""
+LAST = BlurLevel(0.7, 3, 4.0, 0.01)
+"""Of the final pass over all timesteps."""
+SPEED = ((1.5,) * 6 + (3.0, 1.0, 1.0) + (np.inf,) * 6, 0.3, 15.0)
+"""Usual speeds: of angles, radians, the translation, metres, and coefficients, each in a second. Eyes jump."""
 COARSE = 2
 """Number of levels before the static offset is estimated."""
 SHARPEST = 0.7
@@ -224,6 +266,8 @@ class Fitted(NamedTuple):
     """(T,) root mean square distance of the landmarks before the last step, pixels; 0 where none was used."""
     colours: FloatArray
     """(T,) median difference of a colour from that of its point, 8-bit levels."""
+    texture: FloatArray
+    """(P, 4) colour of each sampled vertex, and the weight of its observations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,10 +279,10 @@ class Fitter:
     """C cameras."""
     landmarks: ImageLandmarks
     """Landmarks of T timesteps."""
+    vertices: IntArray
+    """(P,) vertices whose colours are compared."""
     outlines: Sequence[Outline | None] = ()
     """Outlines of the subject in the images of T x C frames; none without masks."""
-    zoom: tuple[float, float] = (0.0, 0.0)
-    """Prior of the focal length of one camera, as of `HeadPrior`; by default it is fixed."""
 
     def _prior(self, keep_shape: bool) -> HeadPrior:
         """Weak prior of all parameters."""
@@ -246,23 +290,7 @@ class Fitter:
         free = [np.inf] * 3
         coefficients = [1.0] * columns.expression_size + [0.5] * columns.eyelid_size
         shape = np.full(self.head.shape_basis.shape[2], 0.0 if keep_shape else SHAPE_SPREAD)
-        zoom = (0.0, 0.0) if keep_shape else self.zoom
-        return HeadPrior(np.array([*ANGLE_SPREAD, *free, *coefficients]), shape, zoom)
-
-    def views_of(self, state: HeadState) -> Views:
-        """The cameras with the estimated focal length."""
-        return self.views.zoomed(state.zoom) if state.zoom else self.views
-
-    def _linearised(self, rig: PointRig, state: HeadState, row: int) -> PosedPoints:
-        """Points of a timestep, with their derivatives by shape and zoom together."""
-        posed = rig.linearised(state.shape, state.poses[row])
-        by_zoom = np.zeros_like(posed.points)
-        if self.zoom[1]:
-            # A longer focal length moves pixels like points that are farther from the axis of the camera.
-            turn, shift = self.views.rotations[0], self.views.shifts[0]
-            aside = (posed.points @ turn.T + shift) * [1, 1, 0]
-            by_zoom = (aside @ turn).astype(by_zoom.dtype)
-        return posed._replace(by_shape=np.concatenate([posed.by_shape, by_zoom[..., None]], axis=2))
+        return HeadPrior(np.array([*ANGLE_SPREAD, *free, *coefficients]), shape)
 
     def start(self, shape: FloatArray | None = None) -> HeadState:
         """A shape, by default the mean, in the rigid pose of the landmarks of one camera at each timestep. Of the
@@ -302,14 +330,19 @@ class Fitter:
         return PointRig(self.head, self.landmarks.corners, self.landmarks.weights)
 
     def add_landmarks(
-        self, equations: NormalEquations, rig: PointRig, state: HeadState, weight: float, leave_out: bool = True
+        self,
+        equations: NormalEquations,
+        rig: PointRig,
+        state: HeadState,
+        weight: float,
+        leave_out: bool = True,
     ) -> FloatArray:
         """Add the landmarks to the equations with a weight; return their root mean square distance at each timestep, (T,) pixels;
         0 where none is used."""
-        distance, views = np.zeros(len(state.poses)), self.views_of(state)
+        distance, views = np.zeros(len(state.poses)), self.views
         emphasis = self._emphasis()
         for row, pixels in enumerate(self.landmarks.pixels):
-            posed = self._linearised(rig, state, row)
+            posed = rig.linearised(state.shape, state.poses[row])
             projected = views.project(posed.points)
             seen = np.isfinite(pixels[..., 0])
             gap = np.where(seen[..., None], pixels - projected.pixels, 0.0)
@@ -384,17 +417,20 @@ class Fitter:
         levels: Sequence[BlurLevel] = LEVELS,
         keep_shape: bool = False,
         scalp: bool = True,
+        texture: FloatArray | None = None,
+        motion: FloatArray | None = None,
         progress: Progress = no_progress,
     ) -> Fitted:
         """Steps on colours of points, landmarks and outlines at the blurs of ``levels``, with or without optimising the
         shape. ``scalp``: Whether the outline of the scalp counts, which the static offset moves to that of the hair. ``stack`` holds the images of all timesteps, the cameras of each together."""
-        vertices = sampled_vertices(self.head)
+        vertices = self.vertices
         rig = PointRig.at_vertices(self.head, vertices)
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
         marks, prior = self.landmark_rig(), self._prior(keep_shape)
         scale = self._pixels_per_millimetre(mesh, state)
         total, done = sum(level.steps for level in levels), 0
         landmarks = colours = cast(FloatArray, np.zeros(len(state.poses)))
+        found = cast(FloatArray, np.zeros((len(vertices), 4)))
         for level in levels:
             stack.filter(max(SHARPEST, level.blur * scale), WIDE_MM * scale)
             samples = self._observations(state, mesh, vertices)
@@ -403,17 +439,21 @@ class Fitter:
                 progress(done, total, f"blur of {level.blur:g} mm")
                 equations = NormalEquations(state)
                 landmarks = self.add_landmarks(equations, marks, state, level.landmarks)
-                colours = self._add_colours(equations, rig, state, stack, samples, level.tolerance)
+                colours, found = self._add_colours(
+                    equations, rig, state, stack, samples, level.tolerance, texture
+                )
+                if motion is not None:
+                    equations.link(state.poses, motion)
                 self._add_outlines(equations, state, outlined)
                 state = equations.step(state, prior)
                 done += 1
-        return Fitted(state, landmarks, colours)
+        return Fitted(state, landmarks, colours, found)
 
     def _outlined(self, state: HeadState, mesh: PointRig, scalp: bool) -> list[OutlinedView]:
         """The outlines of the posed meshes."""
         if not any(self.outlines):
             return []
-        views = self.views_of(state)
+        views = self.views
         finder = MeshOutline(self.head, mesh.points(state.shape, state.poses[0]), views, scalp)
         faces, result = np.asarray(self.head.faces), []
         for row, pose in enumerate(state.poses):
@@ -428,14 +468,16 @@ class Fitter:
                 result.append(OutlinedView(row, camera, points, mesh.mixed(*points), outward))
         return result
 
-    def _add_outlines(self, equations: NormalEquations, state: HeadState, outlined: Sequence[OutlinedView]) -> None:
+    def _add_outlines(
+        self, equations: NormalEquations, state: HeadState, outlined: Sequence[OutlinedView]
+    ) -> None:
         """Add the distances between both outlines to the equations."""
-        cameras = self.views_of(state)
+        cameras = self.views
         for view in outlined:
             outline = self.outlines[view.row * len(cameras.cameras) + view.camera]
             if outline is None:
                 continue
-            posed = self._linearised(view.rig, state, view.row)
+            posed = view.rig.linearised(state.shape, state.poses[view.row])
             projected = cameras.project(posed.points, np.full(len(posed.points), view.camera))
             found = gaps(outline, projected.pixels, view.normals)
             sigma = 1e-3 * OUTLINE_MM * cameras.intrinsics[view.camera, 0, 0] / projected.depth
@@ -448,7 +490,7 @@ class Fitter:
     def fit_offset(self, state: HeadState) -> FloatArray:
         """(V, 3) static offset, metres, that moves the outline of the mesh to those of the masks."""
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
-        views, parts, distances = self.views_of(state), [], []
+        views, parts, distances = self.views, [], []
         for view in self._outlined(state, mesh, True):
             outline = self.outlines[view.row * len(views.cameras) + view.camera]
             if outline is None:
@@ -468,13 +510,13 @@ class Fitter:
         return static_offset(self.head, neutral, points, np.concatenate(distances))
 
     def _pixels_per_millimetre(self, mesh: PointRig, state: HeadState) -> float:
-        views = self.views_of(state)
+        views = self.views
         depth = views.place(mesh.points(state.shape, state.poses[0]))[1]
         return float(np.median(1e-3 * views.intrinsics[:, 0, 0] / np.median(depth, axis=1)))
 
     def _observations(self, state: HeadState, mesh: PointRig, vertices: IntArray) -> Observations:
         """The vertices that each frame sees."""
-        views = self.views_of(state)
+        views = self.views
         occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), views)
         frames, points, weights = [], [], []
         for row, pose in enumerate(state.poses):
@@ -493,9 +535,11 @@ class Fitter:
         stack: FrameStack,
         samples: Observations,
         tolerance: float,
-    ) -> FloatArray:
-        """Add the colours to the equations; return their median difference at each timestep, (T,) 8-bit levels."""
-        views = self.views_of(state)
+        known: FloatArray | None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Add the colours to the equations; return their median difference at each timestep, (T,) 8-bit levels, and the
+        `Fitted.texture`, which is ``known`` if that is given."""
+        views = self.views
         cameras = len(views.cameras)
         bounds = np.searchsorted(samples.frame, np.arange(len(state.poses) + 1) * cameras)
         posed = [rig.points(state.shape, pose) for pose in state.poses]
@@ -506,7 +550,7 @@ class Fitter:
             values, gradients = stack.sample(frame, projected.pixels)
             sampled.append((values, gradients @ projected.derivative.astype(np.float32)))
         values = np.concatenate([part[0] for part in sampled])
-        texture, robust = _texture(values, samples, len(posed[0]), tolerance)
+        texture, robust, total = _texture(values, samples, len(posed[0]), tolerance, known)
         residual = values - texture[samples.point]
         difference = np.zeros(len(state.poses))
         weight = COLOUR_WEIGHT * robust
@@ -518,28 +562,31 @@ class Fitter:
             count = end - start
             entries = (np.ones(count, np.float32), (samples.point[start:end], np.arange(count)))
             gather = csr_array(entries, shape=(len(posed[0]), count))
-            linearised = self._linearised(rig, state, row)
+            linearised = rig.linearised(state.shape, state.poses[row])
             equations.add(row, linearised, (gather @ curvature).reshape(-1, 3, 3), gather @ slope)
             difference[row] = 255 * np.median(np.abs(gap)) if count else 0.0
-        return difference
+        return difference, np.concatenate([texture, total[:, None]], axis=1)
 
 
 def _texture(
-    values: FloatArray, samples: Observations, points: int, tolerance: float
-) -> tuple[FloatArray, FloatArray]:
-    """Robust colour of every point (P, 3) and the Geman-McClure weight of every observation (n,), over its variance."""
+    values: FloatArray, samples: Observations, points: int, tolerance: float, known: FloatArray | None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Robust colour of every point (P, 3), the Geman-McClure weight of every observation (n,), over its variance, and the sum of
+    the weights of every point (P,), not over it. ``known``: (P, 4) colours and weights that are kept instead."""
     weight = samples.weight.astype(np.float32)
     robust = weight
+    texture: FloatArray = np.zeros((points, 3)) if known is None else known[:, :3]
     for _ in range(4):
         total = np.maximum(np.bincount(samples.point, robust, points), 1e-9)
-        sums = [np.bincount(samples.point, robust * channel, points) for channel in values.T]
-        texture = np.stack(sums, axis=1) / total[:, None]
+        if known is None:
+            sums = [np.bincount(samples.point, robust * channel, points) for channel in values.T]
+            texture = np.stack(sums, axis=1) / total[:, None]
         square = ((values - texture[samples.point]) ** 2).sum(axis=1)
         # Points whose colour changes with light or expression count less than those whose colour stays.
         mean_square = np.bincount(samples.point, robust * square, points) / total
         scale = tolerance * np.maximum(mean_square, max(float(np.median(square)), 1e-5))[samples.point]
         robust = weight / (1 + square / scale) ** 2
-    return texture.astype(np.float32), (3 * robust / scale).astype(np.float32)
+    return texture.astype(np.float32), (3 * robust / scale).astype(np.float32), total
 
 
 TRIED = tuple(np.geomspace(0.8, 6.0, 10))
@@ -547,6 +594,8 @@ TRIED = tuple(np.geomspace(0.8, 6.0, 10))
 FRAMES = 16
 WEIGHT = 1.0
 """Weight of a landmark relative to the prior. With that of tracking, residuals due to the prior would hide perspective."""
+CLEAR = 1.02
+"""Minimum ratio of the residuals at both ends of `TRIED` to the smallest one for a determined focal length."""
 INDEPENDENT = 50
 """Number of independent residuals that all landmarks are worth, since their errors are correlated."""
 
@@ -559,6 +608,13 @@ class FocalLength(NamedTuple):
     """(N,) root mean square distance of landmarks, pixels, at each tried focal length."""
     tried: FloatArray
     """(N,) pixels."""
+
+    @property
+    def source(self) -> str:
+        """Whether the landmarks determine the focal length, in words."""
+        if self.residuals[[0, -1]].min() > CLEAR * self.residuals.min():
+            return "estimated from landmarks"
+        return "assumed, since the landmarks hardly determine it; give --focal if you know it"
 
 
 def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, side: float) -> FocalLength:
@@ -575,7 +631,9 @@ def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, s
     sample = sample.of(np.unique(np.linspace(0, len(sample.pixels) - 1, FRAMES).astype(int)))
     tried = side * np.array(TRIED)
     residuals = np.array([_residual(head, camera, sample, focal) for focal in tried])
-    improbable = INDEPENDENT * np.log(residuals) + (np.log(TRIED) - np.log(USUAL_FOCAL)) ** 2 / (2 * FOCAL_SPREAD**2)
+    improbable = INDEPENDENT * np.log(residuals) + (np.log(TRIED) - np.log(USUAL_FOCAL)) ** 2 / (
+        2 * FOCAL_SPREAD**2
+    )
     best = int(improbable.argmin())
     pixels = tried[best]
     if 0 < best < len(tried) - 1:
@@ -589,7 +647,7 @@ def _residual(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, focal:
     K = np.array(camera.K, np.float64)
     K[0, 0] = K[1, 1] = focal
     views = Views([Camera(camera.id, camera.width, camera.height, K, camera.world_to_camera)])
-    fitter = Fitter(head, views, landmarks)
+    fitter = Fitter(head, views, landmarks, np.zeros(0, np.int64))
     state = fitter.fit_landmarks(fitter.start(), weight=WEIGHT)
     equations = NormalEquations(state)
     distances = fitter.add_landmarks(equations, fitter.landmark_rig(), state, WEIGHT)

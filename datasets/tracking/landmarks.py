@@ -313,8 +313,8 @@ class NetworkLandmarks:
                         break
         place = {number: row for row, number in enumerate(self._embedding.landmarks.tolist())}
         pairs = [[place[one], place[other]] for one, other in _PAIRS if one in place and other in place]
-        found = np.array(pairs, np.int64).reshape(-1, 2)
-        return ImageLandmarks(self._embedding.corners, self._embedding.weights, pixels, found)
+        corners, weights = self._embedding.corners, self._embedding.weights
+        return ImageLandmarks(corners, weights, pixels, np.array(pairs, np.int64).reshape(-1, 2))
 
     def _facing(self, found: FloatArray, camera: int) -> BoolArray | None:
         """(L,) mask of landmarks that face the camera; None if they do not form a face."""

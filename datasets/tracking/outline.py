@@ -49,11 +49,18 @@ def outline_of(mask: ByteArray) -> Outline | None:
     if not len(pixels):
         return None
     blurred = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _SMOOTH)
-    slopes = [cv2.Sobel(blurred, cv2.CV_32F, *axes)[*np.floor(pixels[:, ::-1]).astype(int).T] for axes in ((1, 0), (0, 1))]
+    slopes = [
+        cv2.Sobel(blurred, cv2.CV_32F, *axes)[*np.floor(pixels[:, ::-1]).astype(int).T]
+        for axes in ((1, 0), (0, 1))
+    ]
     normals = -np.stack(slopes, axis=1).astype(np.float64)
     length = np.linalg.norm(normals, axis=1)
     pixels, normals = pixels[length > 0], (normals / np.maximum(length, 1e-9)[:, None])[length > 0]
-    return Outline(pixels, normals, cKDTree(np.concatenate([pixels, REACH * normals], axis=1))) if len(pixels) else None
+    return (
+        Outline(pixels, normals, cKDTree(np.concatenate([pixels, REACH * normals], axis=1)))
+        if len(pixels)
+        else None
+    )
 
 
 class OutlinePoints(NamedTuple):
@@ -138,7 +145,9 @@ OFFSET_WEIGHT = 0.05
 _ITERATIONS = 4
 
 
-def static_offset(head: HeadAsset, neutral: FloatArray, points: OutlinePoints, distances: FloatArray) -> FloatArray:
+def static_offset(
+    head: HeadAsset, neutral: FloatArray, points: OutlinePoints, distances: FloatArray
+) -> FloatArray:
     """(V, 3) offset along the normals of a neutral mesh (V, 3) that moves points on outlines by distances (n,), metres, as far
     as a smooth offset can."""
     count = len(neutral)
@@ -156,13 +165,17 @@ def static_offset(head: HeadAsset, neutral: FloatArray, points: OutlinePoints, d
     laplacian = (diags_array(np.ones(count)) - diags_array(1 / degree) @ adjacency).tocsr()[:, free]
     prior = laplacian.T @ laplacian / (1e-3 * SMOOTH_MM) ** 2 + diags_array(1 / spread[free] ** 2)
     rows = np.repeat(np.arange(len(distances)), 2)
-    design = coo_array((points.weights.ravel(), (rows, points.corners.ravel())), shape=(len(distances), count)).tocsr()[:, free]
+    design = coo_array(
+        (points.weights.ravel(), (rows, points.corners.ravel())), shape=(len(distances), count)
+    ).tocsr()[:, free]
     moved = np.zeros(len(free))
     sigma = 1e-3 * OFFSET_MM
     for _ in range(_ITERATIONS):
         left = distances - design @ moved
         weight = OFFSET_WEIGHT / (sigma * (1 + (left / (OFFSET_ROBUST * sigma)) ** 2)) ** 2
-        moved = spsolve((design.T @ diags_array(weight) @ design + prior).tocsc(), design.T @ (weight * distances))
+        moved = spsolve(
+            (design.T @ diags_array(weight) @ design + prior).tocsc(), design.T @ (weight * distances)
+        )
     offset = np.zeros(count)
     offset[free] = moved
     return np.asarray(offset[:, None] * vertex_normals(neutral, np.asarray(head.faces)))

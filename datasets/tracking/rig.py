@@ -108,16 +108,6 @@ class Views:
         self.centers = np.stack([camera.center for camera in cameras])
         self.sizes = np.array([[camera.width, camera.height] for camera in cameras])
 
-    def zoomed(self, zoom: float) -> Views:
-        """The cameras with focal lengths times e to the power ``zoom``."""
-        scale = np.diag([np.exp(zoom)] * 2)
-        changed = []
-        for one in self.cameras:
-            K = np.array(one.K, np.float64)
-            K[:2, :2] = K[:2, :2] @ scale
-            changed.append(Camera(one.id, one.width, one.height, K, one.world_to_camera))
-        return Views(changed)
-
     def place(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels (C, P, 2) and depth (C, P) of points (P, 3), in float32."""
         matrices = self.intrinsics @ np.concatenate([self.rotations, self.shifts[..., None]], axis=2)

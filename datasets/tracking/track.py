@@ -27,7 +27,17 @@ from ..ga.writer import save_npz
 from ..head.geometry import fit_sphere
 from ..head.model import PosedSubject
 from ..open import open_clip
-from .fit import COARSE, LEVELS, Fitter, HeadState, with_offset
+from .fit import (
+    COARSE,
+    LAST,
+    LEVELS,
+    Fitter,
+    HeadState,
+    continuous,
+    motion_spread,
+    sampled_vertices,
+    with_offset,
+)
 from .landmarks import ImageLandmarks, landmark_source
 from .outline import outline_of
 from .rig import FrameStack, PoseColumns, Views, outliers
@@ -110,8 +120,6 @@ def mesh_errors(found: FloatArray, wanted: FloatArray, turns: FloatArray) -> Reg
     return RegionError(spread(gaps), spread(np.stack(mapped)), spread(local - local.mean(axis=0)))
 
 
-FIXED_FOCAL = (0.0, 0.0)
-"""Prior of a focal length that is not estimated."""
 LEAST_TRACKED = 0.5
 """Minimum fraction of timesteps that must be tracked."""
 MOST_TIMESTEPS, MOST_PIXELS = 64, 2.5e8
@@ -191,7 +199,7 @@ def track(
     *,
     notes: Mapping[str, Any] | None = None,
     store: Path | None = None,
-    zoom: tuple[float, float] = FIXED_FOCAL,
+    seconds: float = 0.0,
     progress: Progress = no_progress,
 ) -> Tracked:
     """Estimate shape and poses from images; recorded as a step. The static offset becomes zero.
@@ -199,8 +207,8 @@ def track(
     Timesteps without landmarks, and those whose fit remains an outlier, are not in the clip that is returned.
 
     Neither shape, poses nor static offset of the clip are used, other than by ``source``. The shape is estimated with the
-    first timesteps, spread over the clip, and kept for the others. So is the focal length of a single camera, if ``zoom``,
-    mean and standard deviation of the logarithm of its change, is given.
+    first timesteps, spread over the clip, and kept for the others. ``seconds``: Time
+    between timesteps, where it is known: neighbours then differ little.
 
     ``cameras``: Cameras whose images are used; one is enough. ``source``: Finds landmarks. ``notes``: Recorded with the
     step. ``store``: Folder that keeps the fit of every part, which a later call with the same images and landmarks does not
@@ -219,7 +227,7 @@ def track(
     views = Views([clip.cameras[name] for name in cameras])
     most = min(MOST_TIMESTEPS, max(1, int(MOST_PIXELS // views.sizes.prod(axis=1).sum())))
     blocks = -(-len(timesteps) // most)
-    fits = _Fits(clip, [*cameras], views, store, zoom)
+    fits = _Fits(clip, [*cameras], views, store)
     pixels: dict[int, FloatArray] = {}
     for block in range(blocks):
         landmarks = source(chosen := timesteps[block::blocks])
@@ -240,9 +248,10 @@ def track(
         # Others give the colours of the points.
         others = sorted(good, key=lambda one: min(abs(one - timestep) for timestep in wrong))[:half]
         refitted = sorted([*wrong, *others])
-        again = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in refitted]))
+        marks = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in refitted]))
         part_progress = partial(_part_progress, progress, blocks + number, blocks + len(parts))
-        fits.fit(f"again-{number:05d}", refitted, again, wrong, part_progress)
+        fits.fit(f"again-{number:05d}", refitted, marks, wrong, part_progress)
+    fits.finish({timestep: pixels[timestep] for timestep in fits.poses}, landmarks, seconds, progress)
     last = fits.outliers()
     kept = sorted({*fits.poses} - last)
     report = TrackingReport(
@@ -268,7 +277,6 @@ def track(
         shape=state.shape,
         static_offset=np.asarray(fits.offset, np.float32),
         poses=dict(zip(kept, tracked)),
-        cameras={**clip.cameras, **{one.id: one for one in fits.views.cameras}},
     )
     return Tracked(derived, report)
 
@@ -297,10 +305,10 @@ class _Fits:
     cameras: list[str]
     views: Views
     store: Path | None
-    zoom: tuple[float, float]
     shape: FloatArray | None = None
     offset: FloatArray | None = None
     seconds: float = 0.0
+    textures: list[FloatArray] = field(default_factory=list)
     poses: dict[int, FloatArray] = field(default_factory=dict)
     """(D,) each."""
     residuals: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -310,24 +318,66 @@ class _Fits:
     ) -> None:
         """Fit timesteps, from their poses if there are any, and take the results of some of them."""
         start = np.stack([self.poses[timestep] for timestep in part]) if part[0] in self.poses else None
-        given = self.clip, self.cameras, self.views, part, landmarks, self.shape, self.offset, start, self.zoom, progress
+        given = (
+            self.clip,
+            self.cameras,
+            self.views,
+            part,
+            landmarks,
+            self.shape,
+            self.offset,
+            start,
+            progress,
+        )
         if self.store is None:
             fitted = _fit_block(*given)
         else:
             seen = [[one.id, one.width, one.height, one.K, one.world_to_camera] for one in self.views.cameras]
             heads = self.clip.fingerprint, self.clip.head.fingerprint()
-            mark = digest(TRACKER_VERSION, *heads, seen, part, *landmarks, self.shape, self.offset, start, self.zoom)
+            mark = digest(TRACKER_VERSION, *heads, seen, part, *landmarks, self.shape, self.offset, start)
             file = self.store / f"{name}.npz"
             fitted = cached_arrays(file, mark, _PART, lambda: _fit_block(*given), {"T": len(part)})
         self.shape, self.offset = fitted["shape"], fitted["offset"]
-        if fitted["zoom"]:
-            self.views = self.views.zoomed(float(fitted["zoom"]))
-        self.zoom = FIXED_FOCAL
+        self.textures.append(fitted["texture"])
         self.seconds += float(fitted["seconds"])
         rows = zip(part, fitted["poses"], fitted["landmarks"].tolist(), fitted["colours"].tolist())
         for timestep, pose, *residual in rows:
             if timestep in taken:
                 self.poses[timestep], self.residuals[timestep] = pose, (residual[0], residual[1])
+
+    def finish(
+        self, pixels: Mapping[int, FloatArray], landmarks: ImageLandmarks, seconds: float, progress: Progress
+    ) -> None:
+        """Fit consecutive timesteps together, with the colours of all parts and small differences between neighbours."""
+        begin, known = time.perf_counter(), sorted({*self.poses} - self.outliers())
+        if not known:
+            return
+        assert self.shape is not None
+        total = np.maximum(sum(one[:, 3:] for one in self.textures), 1e-9)
+        texture = np.concatenate(
+            [sum(one[:, :3] * one[:, 3:] for one in self.textures) / total, total], axis=1
+        )
+        most = max(1, int(MOST_PIXELS / 4 // self.views.sizes.prod(axis=1).sum()))
+        count = -(-len(known) // most)
+        for number, part in enumerate(np.array_split(known, count)):
+            part = part.tolist()
+            marks = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in part]))
+            fitter, stack = _fitter(self.clip, self.cameras, self.views, part, marks, self.offset)
+            poses = continuous(np.stack([self.poses[timestep] for timestep in part]))
+            motion = motion_spread(part, seconds, poses.shape[1]) if seconds else None
+            fitted = fitter.fit_colours(
+                HeadState(self.shape, poses),
+                stack,
+                levels=[LAST],
+                keep_shape=True,
+                texture=texture,
+                motion=motion,
+                progress=partial(_part_progress, progress, number, count),
+            )
+            for row, timestep in enumerate(part):
+                self.poses[timestep] = fitted.state.poses[row]
+                self.residuals[timestep] = float(fitted.landmarks[row]), float(fitted.colours[row])
+        self.seconds += time.perf_counter() - begin
 
     def outliers(self) -> set[int]:
         """Timesteps whose fit is one of `outliers`."""
@@ -341,11 +391,28 @@ class _Fits:
 _PART = {
     "shape": Member("f", ("S",)),
     "offset": Member("f", ("V", 3)),
-    "zoom": Member("f", ()),
+    "texture": Member("f", ("P", 4)),
     "poses": Member("f", ("T", "D")),
     **dict.fromkeys(("landmarks", "colours"), Member("f", ("T",))),
     "seconds": Member("f", ()),
 }
+
+
+def _fitter(
+    clip: CaptureClip,
+    cameras: Sequence[str],
+    views: Views,
+    part: Sequence[int],
+    landmarks: ImageLandmarks,
+    offset: FloatArray | None,
+) -> tuple[Fitter, FrameStack]:
+    """For some timesteps."""
+    keys = [clip.frame_at[timestep, name] for timestep in part for name in cameras]
+    masks = [clip.mask(key) for key in keys]
+    outlines = [None if mask is None else outline_of(mask) for mask in masks]
+    head = clip.head if offset is None else with_offset(clip.head, offset)
+    vertices = sampled_vertices(clip.head)
+    return Fitter(head, views, landmarks, vertices, outlines), FrameStack([clip.image(key) for key in keys])
 
 
 def _fit_block(
@@ -357,22 +424,15 @@ def _fit_block(
     shape: FloatArray | None,
     offset: FloatArray | None,
     poses: FloatArray | None,
-    zoom: tuple[float, float],
     progress: Progress,
 ) -> dict[str, np.ndarray]:
     """Fit some timesteps with a given or a newly estimated shape, from given poses or from those of the landmarks.
     Returns the arrays of `_PART`."""
     begin = time.perf_counter()
-    keys = [clip.frame_at[timestep, name] for timestep in part for name in cameras]
-    masks = [clip.mask(key) for key in keys]
-    outlines = [None if mask is None else outline_of(mask) for mask in masks]
-    head = clip.head if offset is None else with_offset(clip.head, offset)
-    fitter = Fitter(head, views, landmarks, outlines=outlines, zoom=zoom)
-    images = [clip.image(clip.frame_at[timestep, name]) for timestep in part for name in cameras]
+    fitter, stack = _fitter(clip, cameras, views, part, landmarks, offset)
     keep = shape is not None
     state = fitter.start(shape) if shape is None or poses is None else HeadState(shape, poses)
     state = fitter.fit_landmarks(state, keep_shape=keep)
-    stack = FrameStack(images)
     if offset is None:
         fitted = fitter.fit_colours(state, stack, levels=LEVELS[:COARSE], scalp=False, progress=progress)
         offset = fitter.fit_offset(fitted.state)
@@ -383,7 +443,7 @@ def _fit_block(
         fitted = fitter.fit_colours(state, stack, keep_shape=True, progress=progress)
     return {
         "offset": offset,
-        "zoom": np.array(fitted.state.zoom),
+        "texture": fitted.texture,
         "shape": fitted.state.shape,
         "poses": fitted.state.poses,
         "landmarks": fitted.landmarks,

@@ -19,8 +19,7 @@ from ..clip import CaptureClip
 from ..head.refit.command import target_head
 from ..tracking.fit import FocalLength, estimate_focal
 from ..tracking.landmarks import Embedding, NetworkLandmarks, head_embedding
-from ..tracking.settings import FOCAL_SPREAD, TRACKER_VERSION, USUAL_FOCAL, make_work_folder
-from ..tracking.track import FIXED_FOCAL
+from ..tracking.settings import TRACKER_VERSION, make_work_folder
 from .clip import FrameView, VideoClip, open_video
 from .faces import LEAST_SEEN, REMEDY, FaceFinder
 
@@ -42,8 +41,8 @@ class OpenedVideo(NamedTuple):
     """Name of the file of the landmark network."""
     numbers: list[int]
     """Numbers in the file of the frames of the clip."""
-    zoom: tuple[float, float]
-    """Prior of the focal length, as `tracking.fit.HeadPrior.zoom`."""
+    seconds: float
+    """Between timesteps of the clip."""
     data: dict[str, Any]
     lines: list[str]
 
@@ -71,7 +70,7 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
             lambda: head_embedding(finder.network, head, teacher, progress)._asdict(),
         )
     )
-    clip, zoom = video.clip, FIXED_FOCAL
+    clip, focal = video.clip, None
     landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
     detected = landmarks(sorted(clip.poses))
     if (count := int(detected.seen.sum())) < LEAST_SEEN * len(detected.seen):
@@ -92,16 +91,15 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
         focal = FocalLength(float(stored["pixels"]), stored["residuals"], stored["tried"])
         clip = video.with_focal(focal.pixels / video.view.scale)
         landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
-        zoom = float(np.log(USUAL_FOCAL * side / focal.pixels)), FOCAL_SPREAD
     return OpenedVideo(
         clip,
         video.view,
         landmarks,
         network.name,
         video.faces.numbers[video.faces.found].tolist(),
-        zoom,
-        _data(video),
-        _lines(video),
+        1 / min(settings.rate, video.info.rate),
+        _data(video, settings.focal, focal),
+        _lines(video, settings.focal, focal),
     )
 
 
@@ -113,7 +111,7 @@ def _embedding_arrays(head: HeadAsset) -> dict[str, Member]:
     }
 
 
-def _data(video: VideoClip) -> dict[str, Any]:
+def _data(video: VideoClip, given: float | None, focal: FocalLength | None) -> dict[str, Any]:
     return {
         "video": {
             **video.info._asdict(),
@@ -123,26 +121,25 @@ def _data(video: VideoClip) -> dict[str, Any]:
             "found_again": [one._asdict() for one in video.faces.again],
             "other_faces": video.faces.numbers[video.faces.others > 0].tolist(),
             **({"unsure": [*video.unsure]} if video.unsure else {}),
+            "focal": dict(zip(("pixels", "source"), _focal(video, given, focal))),
         }
     }
 
 
-def with_focal(video: OpenedVideo, clip: CaptureClip) -> OpenedVideo:
-    """The information with the focal length of the tracked clip."""
-    (camera,) = clip.cameras.values()
-    pixels = float(camera.K[0, 0]) / video.view.scale
-    source = "estimated" if video.zoom[1] else "given"
-    relative = pixels / max(video.data["video"]["width"], video.data["video"]["height"])
-    line = f"  focal      {pixels:.0f} pixels of the video, {relative:.2f} times its longer side, {source}"
-    found = {**video.data["video"], "focal": {"pixels": pixels, "source": source}}
-    return video._replace(data={"video": found}, lines=[*video.lines, line])
+def _focal(video: VideoClip, given: float | None, focal: FocalLength | None) -> tuple[float, str]:
+    """Focal length in pixels of the video, and its source."""
+    if focal is None:
+        return given or 0.0, "given"
+    return focal.pixels / video.view.scale, focal.source
 
 
-def _lines(video: VideoClip) -> list[str]:
+def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> list[str]:
     (camera,) = video.clip.cameras.values()
+    pixels, source = _focal(video, given, focal)
     lines = [
         f"{len(video.clip.files)} frames of {camera.width}x{camera.height} pixels around the head",
         f"  video      {video.info.width}x{video.info.height} pixels, {video.info.rate:.3g} frames a second",
+        f"  focal      {pixels:.0f} pixels of the video, {source}",
     ]
     faces = video.faces
     if video.without_face:
