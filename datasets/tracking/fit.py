@@ -409,20 +409,38 @@ class Fitter:
             state = equations.step(state, still if step < _RIGID else prior, 1e-3)
         return state
 
+    def fit(
+        self, state: HeadState, stack: FrameStack, offset: FloatArray | None, progress: Progress = no_progress
+    ) -> tuple[Fitted, FloatArray]:
+        """Poses from those of the landmarks, with ``offset``, which the head model has, and its shape; or if there is none, with a
+        new shape and offset (V, 3), metres. Returns the offset, too."""
+        if offset is not None:
+            return self.fit_colours(state, stack, levels=LEVELS, keep_shape=True, progress=progress), offset
+        state = self.fit_colours(state, stack, levels=LEVELS[:COARSE], scalp=False, progress=progress).state
+        offset = self.fit_offset(state)
+        fine = replace(self, head=with_offset(cast(HeadArrays, self.head), offset))
+        fitted = fine.fit_colours(state, stack, levels=LEVELS[COARSE:], progress=progress)
+        return fitted, offset + fine.fit_offset(fitted.state)
+
     def fit_colours(
         self,
         state: HeadState,
         stack: FrameStack,
         *,
-        levels: Sequence[BlurLevel] = LEVELS,
+        levels: Sequence[BlurLevel] = (),
         keep_shape: bool = False,
         scalp: bool = True,
-        texture: FloatArray | None = None,
-        motion: FloatArray | None = None,
+        last: tuple[FloatArray, FloatArray | None] | None = None,
         progress: Progress = no_progress,
     ) -> Fitted:
-        """Steps on colours of points, landmarks and outlines at the blurs of ``levels``, with or without optimising the
-        shape. ``scalp``: Whether the outline of the scalp counts, which the static offset moves to that of the hair. ``stack`` holds the images of all timesteps, the cameras of each together."""
+        """Steps on colours of points, landmarks and outlines at the blurs of ``levels``.
+
+        ``stack`` holds the images of all timesteps, the cameras of each together. ``scalp``: Whether the outline of the scalp
+        counts, which the static offset moves to that of the hair. ``last``: In the final pass, colours of all timesteps, as
+        `Fitted.texture`, and `motion_spread`; the shape is kept.
+        """
+        texture, motion = last or (None, None)
+        levels, keep_shape = (levels, keep_shape) if last is None else ([LAST], True)
         vertices = self.vertices
         rig = PointRig.at_vertices(self.head, vertices)
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))

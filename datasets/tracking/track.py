@@ -27,17 +27,7 @@ from ..ga.writer import save_npz
 from ..head.geometry import fit_sphere
 from ..head.model import PosedSubject
 from ..open import open_clip
-from .fit import (
-    COARSE,
-    LAST,
-    LEVELS,
-    Fitter,
-    HeadState,
-    continuous,
-    motion_spread,
-    sampled_vertices,
-    with_offset,
-)
+from .fit import Fitter, HeadState, continuous, motion_spread, sampled_vertices, with_offset
 from .landmarks import ImageLandmarks, landmark_source
 from .outline import outline_of
 from .rig import FrameStack, PoseColumns, Views, outliers
@@ -202,7 +192,7 @@ def track(
     seconds: float = 0.0,
     progress: Progress = no_progress,
 ) -> Tracked:
-    """Estimate shape and poses from images; recorded as a step. The static offset becomes zero.
+    """Estimate shape, static offset and poses from images; recorded as a step.
 
     Timesteps without landmarks, and those whose fit remains an outlier, are not in the clip that is returned.
 
@@ -299,7 +289,7 @@ def _part_progress(progress: Progress, part: int, parts: int, done: int, total: 
 
 @dataclass
 class _Fits:
-    """Fits of parts of a clip's timesteps with one shape, which the first part determines."""
+    """Fits of parts of a clip's timesteps with one shape and static offset, which the first part determines."""
 
     clip: CaptureClip
     cameras: list[str]
@@ -314,27 +304,28 @@ class _Fits:
     residuals: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     def fit(
-        self, name: str, part: list[int], landmarks: ImageLandmarks, taken: list[int], progress: Progress
+        self,
+        name: str,
+        part: list[int],
+        landmarks: ImageLandmarks,
+        taken: list[int],
+        progress: Progress,
+        last: LastPass | None = None,
     ) -> None:
         """Fit timesteps, from their poses if there are any, and take the results of some of them."""
         start = np.stack([self.poses[timestep] for timestep in part]) if part[0] in self.poses else None
         given = (
-            self.clip,
-            self.cameras,
-            self.views,
-            part,
-            landmarks,
-            self.shape,
-            self.offset,
-            start,
-            progress,
+            *(self.clip, self.cameras, self.views, part, landmarks),
+            *(self.shape, self.offset, start, last, progress),
         )
         if self.store is None:
             fitted = _fit_block(*given)
         else:
             seen = [[one.id, one.width, one.height, one.K, one.world_to_camera] for one in self.views.cameras]
             heads = self.clip.fingerprint, self.clip.head.fingerprint()
-            mark = digest(TRACKER_VERSION, *heads, seen, part, *landmarks, self.shape, self.offset, start)
+            mark = digest(
+                TRACKER_VERSION, *heads, seen, part, *landmarks, self.shape, self.offset, start, *(last or ())
+            )
             file = self.store / f"{name}.npz"
             fitted = cached_arrays(file, mark, _PART, lambda: _fit_block(*given), {"T": len(part)})
         self.shape, self.offset = fitted["shape"], fitted["offset"]
@@ -349,35 +340,16 @@ class _Fits:
         self, pixels: Mapping[int, FloatArray], landmarks: ImageLandmarks, seconds: float, progress: Progress
     ) -> None:
         """Fit consecutive timesteps together, with the colours of all parts and small differences between neighbours."""
-        begin, known = time.perf_counter(), sorted({*self.poses} - self.outliers())
-        if not known:
-            return
-        assert self.shape is not None
-        total = np.maximum(sum(one[:, 3:] for one in self.textures), 1e-9)
-        texture = np.concatenate(
-            [sum(one[:, :3] * one[:, 3:] for one in self.textures) / total, total], axis=1
-        )
+        known = sorted({*self.poses} - self.outliers())
+        total = np.maximum(np.sum([one[:, 3:] for one in self.textures], axis=0), 1e-9)
+        colours = np.sum([one[:, :3] * one[:, 3:] for one in self.textures], axis=0) / total
+        texture = np.concatenate([colours, total], axis=1)
         most = max(1, int(MOST_PIXELS / 4 // self.views.sizes.prod(axis=1).sum()))
-        count = -(-len(known) // most)
-        for number, part in enumerate(np.array_split(known, count)):
-            part = part.tolist()
+        parts = [part.tolist() for part in np.array_split(known, -(-len(known) // most) or 1) if len(part)]
+        for number, part in enumerate(parts):
             marks = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in part]))
-            fitter, stack = _fitter(self.clip, self.cameras, self.views, part, marks, self.offset)
-            poses = continuous(np.stack([self.poses[timestep] for timestep in part]))
-            motion = motion_spread(part, seconds, poses.shape[1]) if seconds else None
-            fitted = fitter.fit_colours(
-                HeadState(self.shape, poses),
-                stack,
-                levels=[LAST],
-                keep_shape=True,
-                texture=texture,
-                motion=motion,
-                progress=partial(_part_progress, progress, number, count),
-            )
-            for row, timestep in enumerate(part):
-                self.poses[timestep] = fitted.state.poses[row]
-                self.residuals[timestep] = float(fitted.landmarks[row]), float(fitted.colours[row])
-        self.seconds += time.perf_counter() - begin
+            part_progress = partial(_part_progress, progress, number, len(parts))
+            self.fit(f"last-{number:05d}", part, marks, part, part_progress, LastPass(texture, seconds))
 
     def outliers(self) -> set[int]:
         """Timesteps whose fit is one of `outliers`."""
@@ -398,21 +370,13 @@ _PART = {
 }
 
 
-def _fitter(
-    clip: CaptureClip,
-    cameras: Sequence[str],
-    views: Views,
-    part: Sequence[int],
-    landmarks: ImageLandmarks,
-    offset: FloatArray | None,
-) -> tuple[Fitter, FrameStack]:
-    """For some timesteps."""
-    keys = [clip.frame_at[timestep, name] for timestep in part for name in cameras]
-    masks = [clip.mask(key) for key in keys]
-    outlines = [None if mask is None else outline_of(mask) for mask in masks]
-    head = clip.head if offset is None else with_offset(clip.head, offset)
-    vertices = sampled_vertices(clip.head)
-    return Fitter(head, views, landmarks, vertices, outlines), FrameStack([clip.image(key) for key in keys])
+class LastPass(NamedTuple):
+    """Inputs of the final pass over consecutive timesteps."""
+
+    texture: FloatArray
+    """(P, 4) as `Fitted.texture`."""
+    seconds: float
+    """Between timesteps; 0 where it is not known."""
 
 
 def _fit_block(
@@ -424,27 +388,31 @@ def _fit_block(
     shape: FloatArray | None,
     offset: FloatArray | None,
     poses: FloatArray | None,
+    last: LastPass | None,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
-    """Fit some timesteps with a given or a newly estimated shape, from given poses or from those of the landmarks.
+    """Fit some timesteps with a given or a newly estimated shape and offset, from given poses or from those of the landmarks.
     Returns the arrays of `_PART`."""
     begin = time.perf_counter()
-    fitter, stack = _fitter(clip, cameras, views, part, landmarks, offset)
-    keep = shape is not None
-    state = fitter.start(shape) if shape is None or poses is None else HeadState(shape, poses)
-    state = fitter.fit_landmarks(state, keep_shape=keep)
-    if offset is None:
-        fitted = fitter.fit_colours(state, stack, levels=LEVELS[:COARSE], scalp=False, progress=progress)
-        offset = fitter.fit_offset(fitted.state)
-        fitter, state = replace(fitter, head=with_offset(clip.head, offset)), fitted.state
-        fitted = fitter.fit_colours(state, stack, levels=LEVELS[COARSE:], progress=progress)
-        offset = offset + fitter.fit_offset(fitted.state)
+    keys = [clip.frame_at[timestep, name] for timestep in part for name in cameras]
+    masks = [clip.mask(key) for key in keys]
+    outlines = [None if mask is None else outline_of(mask) for mask in masks]
+    stack = FrameStack([clip.image(key) for key in keys])
+    head = clip.head if offset is None else with_offset(clip.head, offset)
+    fitter = Fitter(head, views, landmarks, sampled_vertices(clip.head), outlines)
+    if last is not None and shape is not None and poses is not None:
+        state = HeadState(shape, continuous(poses))
+        motion = motion_spread(part, last.seconds, state.poses.shape[1]) if last.seconds else None
+        assert offset is not None
+        fitted = fitter.fit_colours(state, stack, last=(last.texture, motion), progress=progress)
     else:
-        fitted = fitter.fit_colours(state, stack, keep_shape=True, progress=progress)
+        state = fitter.start(shape) if shape is None or poses is None else HeadState(shape, poses)
+        state = fitter.fit_landmarks(state, keep_shape=shape is not None)
+        fitted, offset = fitter.fit(state, stack, offset, progress)
     return {
+        "shape": fitted.state.shape,
         "offset": offset,
         "texture": fitted.texture,
-        "shape": fitted.state.shape,
         "poses": fitted.state.poses,
         "landmarks": fitted.landmarks,
         "colours": fitted.colours,
@@ -488,10 +456,15 @@ def with_tracking(
             tracked = track(capture, cameras, source, progress=report).clip
         timesteps = sorted(tracked.poses)
         rows = columns.rows([tracked.poses[timestep] for timestep in timesteps])
-        save_npz(place, {"shape": np.asarray(tracked.shape), "poses": rows, "timesteps": np.array(timesteps)})
-    members = {"shape": Member("f", ("S",), MAX_MAGNITUDE), "poses": Member("f", ("T", "D"), MAX_MAGNITUDE)}
-    members["timesteps"] = Member("i", ("T",))
-    sizes = {"S": capture.head.shape_basis.shape[2], "D": columns.size}
+        arrays = {"shape": np.asarray(tracked.shape), "offset": np.asarray(tracked.static_offset)}
+        save_npz(place, {**arrays, "poses": rows, "timesteps": np.array(timesteps)})
+    members = {
+        "shape": Member("f", ("S",), MAX_MAGNITUDE),
+        "offset": Member("f", ("V", 3), MAX_MAGNITUDE),
+        "poses": Member("f", ("T", "D"), MAX_MAGNITUDE),
+        "timesteps": Member("i", ("T",)),
+    }
+    sizes = {"S": capture.head.shape_basis.shape[2], "D": columns.size, "V": len(capture.head.template)}
     stored = read_arrays(place, members, sizes)
     timesteps = stored["timesteps"].tolist()
     poses = dict(zip(timesteps, columns.poses(stored["poses"], capture.head, capture.subject, timesteps)))
@@ -502,9 +475,9 @@ def with_tracking(
     train = tuple(key for key in capture.splits["train"] if key.timestep in timesteps)
     return capture.derive(
         "track",
-        {**settings, "parameters": digest(stored["shape"], stored["poses"])},
+        {**settings, "parameters": digest(stored["shape"], stored["offset"], stored["poses"])},
         shape=stored["shape"],
-        static_offset=np.zeros(capture.head.template.shape, np.float32),
+        static_offset=stored["offset"],
         poses=poses,
         splits={**capture.splits, "train": train},
     )
