@@ -185,7 +185,7 @@ class BlurLevel(NamedTuple):
     tolerance: float
     """Squared difference of colours at which a weight is a quarter, relative to the usual one."""
     landmarks: float
-    """Weight of a landmark beside the prior."""
+    """Weight of a landmark beside the prior, divided among the cameras."""
 
 
 LEVELS = (
@@ -340,6 +340,7 @@ class Fitter:
         """Add the landmarks to the equations with a weight; return their root mean square distance at each timestep, (T,) pixels;
         0 where none is used."""
         distance, views = np.zeros(len(state.poses)), self.views
+        weight /= len(views.cameras)
         emphasis = self._emphasis()
         for row, pixels in enumerate(self.landmarks.pixels):
             posed = rig.linearised(state.shape, state.poses[row])
@@ -393,7 +394,7 @@ class Fitter:
             residual = gap[camera, a] - gap[camera, b]
             scale = sigma[camera, a] * PAIR_MM / LANDMARK_MM
             square = (residual**2).sum(axis=1)
-            weight = PAIR_WEIGHT / (scale * (1 + square / (ROBUST * scale) ** 2)) ** 2
+            weight = PAIR_WEIGHT / len(seen) / (scale * (1 + square / (ROBUST * scale) ** 2)) ** 2
             width = rows.shape[2]
             equations.add_residuals(row, rows.reshape(-1, width), np.repeat(weight, 2), residual.ravel())
 

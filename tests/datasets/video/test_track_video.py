@@ -331,7 +331,7 @@ def test_the_focal_length_of_exact_landmarks_is_found(filmed, ratio):
     found = estimate_focal(
         plan.head,
         Camera("0", WIDTH, HEIGHT, K * [[2, 1, 1], [1, 2, 1], [1, 1, 1]], motion),
-        ImageLandmarks(corners, weights, np.stack(pixels)[:, None]),
+        ImageLandmarks(corners, weights, np.stack(pixels)[:, None], np.zeros((0, 2), int)),
         HEIGHT,
     )
     assert found.pixels == pytest.approx(wanted, rel=0.15)
