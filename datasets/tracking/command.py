@@ -88,7 +88,15 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
             clip, cameras, settings.landmarks, teacher, seed=settings.seed, progress=progress
         )
     make_work_folder(work)
-    tracked = track(clip, cameras, source, notes=notes, store=work, progress=progress)
+    tracked = track(
+        clip,
+        cameras,
+        source,
+        notes=notes,
+        store=work,
+        seconds=video.seconds if video else 0.0,
+        progress=progress,
+    )
     if video is not None:
         tracked = tracked._replace(
             clip=without_torso(tracked.clip, settings.cut, settings.parsing, video.view.image)

@@ -6,18 +6,24 @@ length of one camera from landmarks of a head model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
+from scipy.linalg import solveh_banded
 from scipy.sparse import csr_array
 
-from ...bench.contracts import Camera, FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.contracts import BoolArray, Camera, FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError
+from ..head.arrays import HeadArrays
+from ..head.geometry import vertex_normals
 from .landmarks import ImageLandmarks, spread_vertices
-from .rig import FrameStack, Occlusion, PointRig, PoseColumns, PosedPoints, Views
+from .outline import MeshOutline, Outline, OutlinePoints, gaps, static_offset
+from .rig import FrameStack, Occlusion, PointRig, PoseColumns, PosedPoints, Projection, Views
+from .settings import FOCAL_SPREAD, USUAL_FOCAL
 
 
 class HeadState(NamedTuple):
@@ -38,14 +44,20 @@ class HeadPrior(NamedTuple):
     """(S,) the same."""
 
 
-class NormalEquations:
-    """Sums of ``J' A J`` and ``J' b`` over points, for T timesteps with D parameters each and S shared ones."""
+def with_offset(head: HeadArrays, offset: FloatArray) -> HeadArrays:
+    """The head model with a static offset (V, 3) in its template."""
+    return replace(head, template=np.asarray(head.template + offset, head.template.dtype))
 
-    def __init__(self, timesteps: int, pose_size: int, shape_size: int):
-        whole = pose_size + shape_size
-        self._split = pose_size
+
+class NormalEquations:
+    """Sums of ``J' A J`` and ``J' b`` over points, for T timesteps with D parameters each and S shared ones. ``state``: Estimate with these sizes."""
+
+    def __init__(self, state: HeadState):
+        timesteps, self._split = state.poses.shape
+        whole = self._split + len(state.shape)
         self._matrices = np.zeros((timesteps, whole, whole))
         self._rights = np.zeros((timesteps, whole))
+        self._links: FloatArray | None = None
 
     def add(self, timestep: int, posed: PosedPoints, curvature: FloatArray, slope: FloatArray) -> None:
         """Add the points of a timestep.
@@ -59,6 +71,25 @@ class NormalEquations:
         flat = jacobian.reshape(-1, width)
         self._matrices[timestep] += flat.T @ bent.reshape(-1, width)
         self._rights[timestep] += flat.T @ slope.astype(jacobian.dtype).reshape(-1)
+
+    def add_residuals(
+        self, timestep: int, jacobian: FloatArray, weight: FloatArray, residual: FloatArray
+    ) -> None:
+        """Add residuals (n,) of a timestep with weights (n,) and derivatives (n, D + S) of the estimated values."""
+        weighted = jacobian * weight[:, None]
+        self._matrices[timestep] += jacobian.T @ weighted
+        self._rights[timestep] += weighted.T @ residual
+
+    def link(self, poses: FloatArray, deviations: FloatArray) -> None:
+        """Expect consecutive poses (T, D) to differ by standard deviations (T - 1, D); infinity for none."""
+        stiffness = deviations**-2.0
+        pull = stiffness * np.diff(poses, axis=0)
+        pose = np.arange(self._split)
+        self._links = stiffness
+        self._matrices[:-1, pose, pose] += stiffness
+        self._matrices[1:, pose, pose] += stiffness
+        self._rights[:-1, pose] += pull
+        self._rights[1:, pose] -= pull
 
     def step(self, state: HeadState, prior: HeadPrior, damping: float = 1e-6) -> HeadState:
         """The state after a step with the prior. ``damping``: Fraction of the diagonal that is added to it
@@ -81,16 +112,49 @@ class NormalEquations:
         matrices[:, diagonal, diagonal] += (
             stiffness + damping * matrices[:, diagonal, diagonal] + 1e-9 + ~free
         )
-        own, shared, corner = (
+        if self._links is not None:  # the shape is fixed
+            return state._replace(poses=state.poses + _chain(matrices, rights[:, :split], self._links))
+        own, mixed, corner = (
             matrices[:, :split, :split],
             matrices[:, :split, split:],
             matrices[:, split:, split:],
         )
-        solved = np.linalg.solve(own, np.concatenate([rights[:, :split, None], shared], axis=2))
-        schur = corner.sum(axis=0) - np.einsum("tds,tdr->sr", shared, solved[:, :, 1:])
-        right = rights[:, split:].sum(axis=0) - np.einsum("tds,td->s", shared, solved[:, :, 0])
+        solved = np.linalg.solve(own, np.concatenate([rights[:, :split, None], mixed], axis=2))
+        schur = corner.sum(axis=0) - np.einsum("tds,tdr->sr", mixed, solved[:, :, 1:])
+        right = rights[:, split:].sum(axis=0) - np.einsum("tds,td->s", mixed, solved[:, :, 0])
         change = np.linalg.solve(schur, right) if len(right) else right
         return HeadState(state.shape + change, state.poses + solved[:, :, 0] - solved[:, :, 1:] @ change)
+
+
+def _chain(matrices: FloatArray, rights: FloatArray, links: FloatArray) -> FloatArray:
+    """(T, D) solution of systems of which each is linked with the next one. ``matrices``: (T, D or more, the same), symmetric.
+    ``links``: (T - 1, D) negative derivatives between the same parameters of consecutive timesteps."""
+    count, size = rights.shape
+    bands = np.zeros((size + 1, count * size))
+    for below in range(size):
+        diagonal = np.diagonal(matrices[:, :size, :size], -below, 1, 2)  # (T, size - below)
+        bands[below].reshape(count, size)[:, : size - below] = diagonal
+    bands[size, : (count - 1) * size] = -links.ravel()
+    return np.asarray(solveh_banded(bands, rights.ravel(), lower=True)).reshape(count, size)
+
+
+def continuous(poses: FloatArray) -> FloatArray:
+    """Poses (T, D) whose rotation vectors (the first three columns) differ least from those of the timestep before. A head that
+    faces a camera is turned by about half a turn, where there are two vectors for about the same rotation."""
+    result = poses.copy()
+    for before, after in pairwise(result):
+        angle = max(float(np.linalg.norm(after[:3])), 1e-9)
+        other = after[:3] * (1 - 2 * np.pi / angle)
+        if np.linalg.norm(other - before[:3]) < np.linalg.norm(after[:3] - before[:3]):
+            after[:3] = other
+    return result
+
+
+def motion_spread(timesteps: Sequence[int], seconds: float, size: int) -> FloatArray:
+    """(T - 1, D) standard deviations of the differences between poses of consecutive timesteps, ``seconds`` apart."""
+    angles, translation, coefficient = SPEED
+    usual = np.array([*angles, *(translation,) * 3, *(coefficient,) * (size - len(angles) - 3)])
+    return np.asarray(seconds * np.diff(timesteps)[:, None] * usual)
 
 
 ANGLE_SPREAD = (np.inf,) * 3 + (0.15,) * 3 + (0.3, 0.03, 0.02) + (0.2, 0.3, 0.02) * 2
@@ -120,22 +184,34 @@ class BlurLevel(NamedTuple):
     steps: int
     tolerance: float
     """Squared difference of colours at which a weight is a quarter, relative to the usual one."""
+    landmarks: float
+    """Weight of a landmark beside the prior, divided among the cameras."""
 
 
 LEVELS = (
-    BlurLevel(5.0, 4, 64.0),
-    BlurLevel(2.5, 5, 32.0),
-    BlurLevel(1.2, 5, 16.0),
-    BlurLevel(0.7, 6, 4.0),
+    BlurLevel(5.0, 4, 64.0, 0.05),
+    BlurLevel(2.5, 5, 32.0, 0.03),
+    BlurLevel(1.2, 5, 16.0, 0.02),
+    BlurLevel(0.7, 6, 4.0, 0.01),
 )
-"""From coarse to fine. A narrow tolerance at coarse levels would reject the points that move most."""
+"""From coarse to fine. A narrow tolerance at coarse levels would reject the points that move most. All weights are small because
+errors of landmarks are correlated over time and those of points in space, so that sums over them overstate certainty."""
+LAST = BlurLevel(0.7, 3, 4.0, 0.01)
+"""Of the final pass over all timesteps."""
+SPEED = ((1.5,) * 6 + (3.0, 1.0, 1.0) + (np.inf,) * 6, 0.3, 15.0)
+"""Usual speeds: of angles, radians, the translation, metres, and coefficients, each in a second. Eyes jump."""
+COARSE = 2
+"""Number of levels before the static offset is estimated."""
 SHARPEST = 0.7
 """Minimum blur, pixels."""
 WIDE_MM = 6.0
 """Blur that is subtracted from the images."""
-LANDMARK_WEIGHT, COLOUR_WEIGHT = 0.005, 0.1
-"""Weights of a landmark and of a colour beside the prior. They are small because errors of landmarks are correlated over
-time and those of points in space, so that sums over them overstate certainty."""
+COLOUR_WEIGHT = 0.1
+"""Weight of a colour beside the prior."""
+EMPHASIS = (("eye_region", 4.0), ("lips", 10.0))
+"""Weights of landmarks of regions relative to others."""
+PAIR_MM, PAIR_WEIGHT = 1.0, 0.05
+"""Expected error of the difference between the landmarks of a pair, and its weight, as of a landmark."""
 SHAPE_SPREAD = 0.3
 """Standard deviation of the prior of the identity coefficients; less than 1 for the same reason."""
 
@@ -164,6 +240,24 @@ def sampled_vertices(head: HeadAsset) -> IntArray:
     return np.unique(np.concatenate(chosen))
 
 
+OUTLINE_MM, OUTLINE_ROBUST = 1.5, 4.0
+"""Expected error of a point of an outline, and the multiple of it at which its weight is a quarter."""
+OUTLINE_WEIGHT = 0.01
+"""Weight of a point of an outline, as of a landmark."""
+
+
+class OutlinedView(NamedTuple):
+    """Points of the mesh on its outline in an image."""
+
+    row: int
+    """Of the timestep."""
+    camera: int
+    points: OutlinePoints
+    rig: PointRig
+    normals: FloatArray
+    """(n, 2) outward, in the image."""
+
+
 class Fitted(NamedTuple):
     """Result of a fit."""
 
@@ -172,6 +266,8 @@ class Fitted(NamedTuple):
     """(T,) root mean square distance of the landmarks before the last step, pixels; 0 where none was used."""
     colours: FloatArray
     """(T,) median difference of a colour from that of its point, 8-bit levels."""
+    texture: FloatArray
+    """(P, 4) colour of each sampled vertex, and the weight of its observations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +279,10 @@ class Fitter:
     """C cameras."""
     landmarks: ImageLandmarks
     """Landmarks of T timesteps."""
-    landmark_weight: float = LANDMARK_WEIGHT
+    vertices: IntArray
+    """(P,) vertices whose colours are compared."""
+    outlines: Sequence[Outline | None] = ()
+    """Outlines of the subject in the images of T x C frames; none without masks."""
 
     def _prior(self, keep_shape: bool) -> HeadPrior:
         """Weak prior of all parameters."""
@@ -231,77 +330,213 @@ class Fitter:
         return PointRig(self.head, self.landmarks.corners, self.landmarks.weights)
 
     def add_landmarks(
-        self, equations: NormalEquations, rig: PointRig, state: HeadState, leave_out: bool = True
+        self,
+        equations: NormalEquations,
+        rig: PointRig,
+        state: HeadState,
+        weight: float,
+        leave_out: bool = True,
     ) -> FloatArray:
-        """Add the landmarks to the equations; return their root mean square distance at each timestep, (T,) pixels;
+        """Add the landmarks to the equations with a weight; return their root mean square distance at each timestep, (T,) pixels;
         0 where none is used."""
-        distance = np.zeros(len(state.poses))
+        distance, views = np.zeros(len(state.poses)), self.views
+        weight /= len(views.cameras)
+        emphasis = self._emphasis()
         for row, pixels in enumerate(self.landmarks.pixels):
             posed = rig.linearised(state.shape, state.poses[row])
-            projected = self.views.project(posed.points)
+            projected = views.project(posed.points)
             seen = np.isfinite(pixels[..., 0])
             gap = np.where(seen[..., None], pixels - projected.pixels, 0.0)
-            per_metre = self.views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
+            per_metre = views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
             sigma = 1e-3 * LANDMARK_MM * per_metre
             square = (gap**2).sum(axis=2)
             # All landmarks of an image may be wrong if the network detects something else as a face.
             if leave_out:
                 near = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
                 seen &= ((seen & near).sum(axis=1) > seen.sum(axis=1) / 2)[:, None]
-            robust = seen * self.landmark_weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
+            robust = seen * emphasis * weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
             distance[row] = np.sqrt((seen * square).sum() / max(seen.sum(), 1))
             weighted = robust[..., None, None] * projected.derivative
             curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
             slope = np.einsum("cpki,cpk->pi", weighted, gap)
             equations.add(row, posed, curvature, slope)
+            self._add_pairs(equations, row, posed, projected, gap * seen[..., None], sigma, seen)
         return distance
 
-    def fit_landmarks(self, state: HeadState, *, keep_shape: bool = False) -> HeadState:
+    def _emphasis(self) -> FloatArray:
+        """(L,) weights of landmarks relative to one another."""
+        weights = np.ones(len(self.landmarks.corners))
+        for name, weight in EMPHASIS:
+            members = np.isin(self.landmarks.corners, np.asarray(self.head.regions.get(name, ()), np.int64))
+            weights[members.any(axis=1)] = weight
+        return weights
+
+    def _add_pairs(
+        self,
+        equations: NormalEquations,
+        row: int,
+        posed: PosedPoints,
+        projected: Projection,
+        gap: FloatArray,
+        sigma: FloatArray,
+        seen: BoolArray,
+    ) -> None:
+        """Add the differences between the landmarks of pairs."""
+        one, other = self.landmarks.pairs.T
+        jacobian = np.concatenate([posed.by_pose, posed.by_shape], axis=2)
+        for camera in range(len(seen)):
+            kept = np.flatnonzero(seen[camera, one] & seen[camera, other])
+            if not len(kept):
+                continue
+            a, b = one[kept], other[kept]
+            by_pixel = projected.derivative[camera]
+            rows = by_pixel[a] @ jacobian[a] - by_pixel[b] @ jacobian[b]  # (n, 2, D + S)
+            residual = gap[camera, a] - gap[camera, b]
+            scale = sigma[camera, a] * PAIR_MM / LANDMARK_MM
+            square = (residual**2).sum(axis=1)
+            weight = PAIR_WEIGHT / len(seen) / (scale * (1 + square / (ROBUST * scale) ** 2)) ** 2
+            width = rows.shape[2]
+            equations.add_residuals(row, rows.reshape(-1, width), np.repeat(weight, 2), residual.ravel())
+
+    def fit_landmarks(
+        self, state: HeadState, *, keep_shape: bool = False, weight: float = LEVELS[0].landmarks
+    ) -> HeadState:
         """Steps on the landmarks alone, the first of the rigid pose only."""
         rig, prior = self.landmark_rig(), self._prior(keep_shape)
         still = HeadPrior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
         for step in range(_RIGID + _STEPS):
-            equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
-            self.add_landmarks(equations, rig, state, leave_out=step >= _RIGID)
+            equations = NormalEquations(state)
+            self.add_landmarks(equations, rig, state, weight, leave_out=step >= _RIGID)
             state = equations.step(state, still if step < _RIGID else prior, 1e-3)
         return state
+
+    def fit(
+        self, state: HeadState, stack: FrameStack, offset: FloatArray | None, progress: Progress = no_progress
+    ) -> tuple[Fitted, FloatArray]:
+        """Poses from those of the landmarks, with ``offset``, which the head model has, and its shape; or if there is none, with a
+        new shape and offset (V, 3), metres. Returns the offset, too."""
+        if offset is not None:
+            return self.fit_colours(state, stack, levels=LEVELS, keep_shape=True, progress=progress), offset
+        state = self.fit_colours(state, stack, levels=LEVELS[:COARSE], scalp=False, progress=progress).state
+        offset = self.fit_offset(state)
+        fine = replace(self, head=with_offset(cast(HeadArrays, self.head), offset))
+        fitted = fine.fit_colours(state, stack, levels=LEVELS[COARSE:], progress=progress)
+        return fitted, offset + fine.fit_offset(fitted.state)
 
     def fit_colours(
         self,
         state: HeadState,
         stack: FrameStack,
         *,
+        levels: Sequence[BlurLevel] = (),
         keep_shape: bool = False,
+        scalp: bool = True,
+        last: tuple[FloatArray, FloatArray | None] | None = None,
         progress: Progress = no_progress,
     ) -> Fitted:
-        """Steps on colours of points and landmarks at the blurs of `LEVELS`, with or without optimising the shape.
-        ``stack`` holds the images of all timesteps, the cameras of each together."""
-        vertices = sampled_vertices(self.head)
+        """Steps on colours of points, landmarks and outlines at the blurs of ``levels``.
+
+        ``stack`` holds the images of all timesteps, the cameras of each together. ``scalp``: Whether the outline of the scalp
+        counts, which the static offset moves to that of the hair. ``last``: In the final pass, colours of all timesteps, as
+        `Fitted.texture`, and `motion_spread`; the shape is kept.
+        """
+        texture, motion = last or (None, None)
+        levels, keep_shape = (levels, keep_shape) if last is None else ([LAST], True)
+        vertices = self.vertices
         rig = PointRig.at_vertices(self.head, vertices)
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
         marks, prior = self.landmark_rig(), self._prior(keep_shape)
         scale = self._pixels_per_millimetre(mesh, state)
-        total, done = sum(level.steps for level in LEVELS), 0
+        total, done = sum(level.steps for level in levels), 0
         landmarks = colours = cast(FloatArray, np.zeros(len(state.poses)))
-        for level in LEVELS:
+        found = cast(FloatArray, np.zeros((len(vertices), 4)))
+        for level in levels:
             stack.filter(max(SHARPEST, level.blur * scale), WIDE_MM * scale)
             samples = self._observations(state, mesh, vertices)
+            outlined = self._outlined(state, mesh, scalp)
             for _ in range(level.steps):
                 progress(done, total, f"blur of {level.blur:g} mm")
-                equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
-                landmarks = self.add_landmarks(equations, marks, state)
-                colours = self._add_colours(equations, rig, state, stack, samples, level.tolerance)
+                equations = NormalEquations(state)
+                landmarks = self.add_landmarks(equations, marks, state, level.landmarks)
+                colours, found = self._add_colours(
+                    equations, rig, state, stack, samples, level.tolerance, texture
+                )
+                if motion is not None:
+                    equations.link(state.poses, motion)
+                self._add_outlines(equations, state, outlined)
                 state = equations.step(state, prior)
                 done += 1
-        return Fitted(state, landmarks, colours)
+        return Fitted(state, landmarks, colours, found)
+
+    def _outlined(self, state: HeadState, mesh: PointRig, scalp: bool) -> list[OutlinedView]:
+        """The outlines of the posed meshes."""
+        if not any(self.outlines):
+            return []
+        views = self.views
+        finder = MeshOutline(self.head, mesh.points(state.shape, state.poses[0]), views, scalp)
+        faces, result = np.asarray(self.head.faces), []
+        for row, pose in enumerate(state.poses):
+            posed = mesh.points(state.shape, pose).astype(np.float64)
+            normals = vertex_normals(posed, faces)
+            for camera, points in enumerate(finder.points(posed)):
+                if not len(points.corners):
+                    continue
+                mixed = np.einsum("nk,nki->ni", points.weights, normals[points.corners])
+                outward = (mixed @ views.rotations[camera].T)[:, :2]
+                outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+                result.append(OutlinedView(row, camera, points, mesh.mixed(*points), outward))
+        return result
+
+    def _add_outlines(
+        self, equations: NormalEquations, state: HeadState, outlined: Sequence[OutlinedView]
+    ) -> None:
+        """Add the distances between both outlines to the equations."""
+        cameras = self.views
+        for view in outlined:
+            outline = self.outlines[view.row * len(cameras.cameras) + view.camera]
+            if outline is None:
+                continue
+            posed = view.rig.linearised(state.shape, state.poses[view.row])
+            projected = cameras.project(posed.points, np.full(len(posed.points), view.camera))
+            found = gaps(outline, projected.pixels, view.normals)
+            sigma = 1e-3 * OUTLINE_MM * cameras.intrinsics[view.camera, 0, 0] / projected.depth
+            robust = found.aligned * OUTLINE_WEIGHT
+            robust /= (sigma * (1 + (found.distance / (OUTLINE_ROBUST * sigma)) ** 2)) ** 2
+            along = np.einsum("ni,nik->nk", found.normals, projected.derivative)
+            curvature = robust[:, None, None] * along[:, :, None] * along[:, None]
+            equations.add(view.row, posed, curvature, (robust * found.distance)[:, None] * along)
+
+    def fit_offset(self, state: HeadState) -> FloatArray:
+        """(V, 3) static offset, metres, that moves the outline of the mesh to those of the masks."""
+        mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
+        views, parts, distances = self.views, [], []
+        for view in self._outlined(state, mesh, True):
+            outline = self.outlines[view.row * len(views.cameras) + view.camera]
+            if outline is None:
+                continue
+            projected = views.project(
+                view.rig.points(state.shape, state.poses[view.row]), np.full(len(view.normals), view.camera)
+            )
+            found = gaps(outline, projected.pixels, view.normals)
+            kept = found.aligned > 0
+            metres = found.distance * projected.depth / views.intrinsics[view.camera, 0, 0]
+            parts.append(OutlinePoints(view.points.corners[kept], view.points.weights[kept]))
+            distances.append(metres[kept])
+        if not parts:
+            return np.zeros(np.shape(self.head.template))
+        neutral = np.asarray(self.head.template + self.head.shape_basis @ state.shape, np.float64)
+        points = OutlinePoints(*map(np.concatenate, zip(*parts)))
+        return static_offset(self.head, neutral, points, np.concatenate(distances))
 
     def _pixels_per_millimetre(self, mesh: PointRig, state: HeadState) -> float:
-        depth = self.views.place(mesh.points(state.shape, state.poses[0]))[1]
-        return float(np.median(1e-3 * self.views.intrinsics[:, 0, 0] / np.median(depth, axis=1)))
+        views = self.views
+        depth = views.place(mesh.points(state.shape, state.poses[0]))[1]
+        return float(np.median(1e-3 * views.intrinsics[:, 0, 0] / np.median(depth, axis=1)))
 
     def _observations(self, state: HeadState, mesh: PointRig, vertices: IntArray) -> Observations:
         """The vertices that each frame sees."""
-        occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), self.views)
+        views = self.views
+        occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), views)
         frames, points, weights = [], [], []
         for row, pose in enumerate(state.poses):
             cosine = occlusion.visible(mesh.points(state.shape, pose).astype(np.float64), vertices)
@@ -319,19 +554,22 @@ class Fitter:
         stack: FrameStack,
         samples: Observations,
         tolerance: float,
-    ) -> FloatArray:
-        """Add the colours to the equations; return their median difference at each timestep, (T,) 8-bit levels."""
-        cameras = len(self.views.cameras)
+        known: FloatArray | None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Add the colours to the equations; return their median difference at each timestep, (T,) 8-bit levels, and the
+        `Fitted.texture`, which is ``known`` if that is given."""
+        views = self.views
+        cameras = len(views.cameras)
         bounds = np.searchsorted(samples.frame, np.arange(len(state.poses) + 1) * cameras)
         posed = [rig.points(state.shape, pose) for pose in state.poses]
         sampled = []
         for row, (start, end) in enumerate(pairwise(bounds)):
             frame, point = samples.frame[start:end], samples.point[start:end]
-            projected = self.views.project(posed[row][point], frame - row * cameras)
+            projected = views.project(posed[row][point], frame - row * cameras)
             values, gradients = stack.sample(frame, projected.pixels)
             sampled.append((values, gradients @ projected.derivative.astype(np.float32)))
         values = np.concatenate([part[0] for part in sampled])
-        texture, robust = _texture(values, samples, len(posed[0]), tolerance)
+        texture, robust, total = _texture(values, samples, len(posed[0]), tolerance, known)
         residual = values - texture[samples.point]
         difference = np.zeros(len(state.poses))
         weight = COLOUR_WEIGHT * robust
@@ -346,34 +584,39 @@ class Fitter:
             linearised = rig.linearised(state.shape, state.poses[row])
             equations.add(row, linearised, (gather @ curvature).reshape(-1, 3, 3), gather @ slope)
             difference[row] = 255 * np.median(np.abs(gap)) if count else 0.0
-        return difference
+        return difference, np.concatenate([texture, total[:, None]], axis=1)
 
 
 def _texture(
-    values: FloatArray, samples: Observations, points: int, tolerance: float
-) -> tuple[FloatArray, FloatArray]:
-    """Robust colour of every point (P, 3) and the Geman-McClure weight of every observation (n,), over its variance."""
+    values: FloatArray, samples: Observations, points: int, tolerance: float, known: FloatArray | None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Robust colour of every point (P, 3), the Geman-McClure weight of every observation (n,), over its variance, and the sum of
+    the weights of every point (P,), not over it. ``known``: (P, 4) colours and weights that are kept instead."""
     weight = samples.weight.astype(np.float32)
     robust = weight
+    texture: FloatArray = np.zeros((points, 3)) if known is None else known[:, :3]
     for _ in range(4):
         total = np.maximum(np.bincount(samples.point, robust, points), 1e-9)
-        sums = [np.bincount(samples.point, robust * channel, points) for channel in values.T]
-        texture = np.stack(sums, axis=1) / total[:, None]
+        if known is None:
+            sums = [np.bincount(samples.point, robust * channel, points) for channel in values.T]
+            texture = np.stack(sums, axis=1) / total[:, None]
         square = ((values - texture[samples.point]) ** 2).sum(axis=1)
         # Points whose colour changes with light or expression count less than those whose colour stays.
         mean_square = np.bincount(samples.point, robust * square, points) / total
         scale = tolerance * np.maximum(mean_square, max(float(np.median(square)), 1e-5))[samples.point]
         robust = weight / (1 + square / scale) ** 2
-    return texture.astype(np.float32), (3 * robust / scale).astype(np.float32)
+    return texture.astype(np.float32), (3 * robust / scale).astype(np.float32), total
 
 
-TRIED = tuple(np.geomspace(0.8, 5.0, 9))
+TRIED = tuple(np.geomspace(0.8, 6.0, 10))
 """Focal lengths relative to the longer side of the picture."""
 FRAMES = 16
 WEIGHT = 1.0
 """Weight of a landmark relative to the prior. With that of tracking, residuals due to the prior would hide perspective."""
 CLEAR = 1.02
 """Minimum ratio of the residuals at both ends of `TRIED` to the smallest one for a determined focal length."""
+INDEPENDENT = 50
+"""Number of independent residuals that all landmarks are worth, since their errors are correlated."""
 
 
 class FocalLength(NamedTuple):
@@ -386,14 +629,15 @@ class FocalLength(NamedTuple):
     """(N,) pixels."""
 
     @property
-    def clear(self) -> bool:
-        """Whether the landmarks determine the focal length."""
-        best = int(self.residuals.argmin())
-        return 0 < best < len(self.tried) - 1 and self.residuals[[0, -1]].min() > CLEAR * self.residuals[best]
+    def source(self) -> str:
+        """Whether the landmarks determine the focal length, in words."""
+        if self.residuals[[0, -1]].min() > CLEAR * self.residuals.min():
+            return "estimated from landmarks"
+        return "assumed, since the landmarks hardly determine it; give --focal if you know it"
 
 
 def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, side: float) -> FocalLength:
-    """The focal length at which the head model fits landmarks of one camera best.
+    """The most probable focal length of one camera by landmarks of a head model and the prior of `USUAL_FOCAL`.
 
     Shape, poses and expressions are fitted for each tried length; between them the minimum of a parabola in its logarithm is
     taken. Landmarks have systematic errors of some millimetres, and a near face with a short lens looks like a longer face, so that
@@ -406,10 +650,13 @@ def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, s
     sample = sample.of(np.unique(np.linspace(0, len(sample.pixels) - 1, FRAMES).astype(int)))
     tried = side * np.array(TRIED)
     residuals = np.array([_residual(head, camera, sample, focal) for focal in tried])
-    best = int(residuals.argmin())
+    improbable = INDEPENDENT * np.log(residuals) + (np.log(TRIED) - np.log(USUAL_FOCAL)) ** 2 / (
+        2 * FOCAL_SPREAD**2
+    )
+    best = int(improbable.argmin())
     pixels = tried[best]
     if 0 < best < len(tried) - 1:
-        below, least, above = residuals[best - 1 : best + 2]
+        below, least, above = improbable[best - 1 : best + 2]
         step = 0.5 * (below - above) / (below - 2 * least + above)
         pixels = tried[best] * (tried[best + 1] / tried[best]) ** step
     return FocalLength(float(pixels), residuals, tried)
@@ -419,8 +666,8 @@ def _residual(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, focal:
     K = np.array(camera.K, np.float64)
     K[0, 0] = K[1, 1] = focal
     views = Views([Camera(camera.id, camera.width, camera.height, K, camera.world_to_camera)])
-    fitter = Fitter(head, views, landmarks, WEIGHT)
-    state = fitter.fit_landmarks(fitter.start())
-    equations = NormalEquations(len(state.poses), state.poses.shape[1], len(state.shape))
-    distances = fitter.add_landmarks(equations, fitter.landmark_rig(), state)
+    fitter = Fitter(head, views, landmarks, np.zeros(0, np.int64))
+    state = fitter.fit_landmarks(fitter.start(), weight=WEIGHT)
+    equations = NormalEquations(state)
+    distances = fitter.add_landmarks(equations, fitter.landmark_rig(), state, WEIGHT)
     return float(np.sqrt(np.mean(distances**2)))

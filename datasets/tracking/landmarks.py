@@ -46,6 +46,15 @@ FACING = 0.5
 _FEWEST = 0.15  # fraction of images in which a landmark must hit the mesh
 
 
+_PAIRS = (
+    *((13, 14), (82, 87), (81, 178), (80, 88), (312, 317), (311, 402), (310, 318)),  # inner lips
+    *((0, 17), (37, 84), (267, 314), (61, 291)),  # outer lips, and corners of the mouth
+    *((159, 145), (158, 153), (160, 144), (157, 154), (161, 163)),  # right lids
+    *((386, 374), (385, 380), (387, 373), (384, 381), (388, 390)),  # left lids
+)
+"""Landmarks of MediaPipe whose distance shows how far mouth and eyes are open."""
+
+
 class Embedding(NamedTuple):
     """Points of a head model that correspond to landmarks."""
 
@@ -141,6 +150,8 @@ class ImageLandmarks(NamedTuple):
     """(L, 3) barycentric weights."""
     pixels: FloatArray
     """(T, C, L, 2) places, pixels; NaN where a landmark was not found."""
+    pairs: IntArray
+    """(N, 2) landmarks on opposite lips and lids, whose differences are more exact than the places."""
 
     def of(self, timesteps: IntArray | BoolArray) -> ImageLandmarks:
         """Those of some timesteps, indices or a mask."""
@@ -200,7 +211,8 @@ def known_rig_landmarks(
         detected = projected.pixels + error * per_metre[..., None]
         pixels[row] = np.where(cosine[..., None] > 0.5, detected, np.nan)
     corners = np.repeat(vertices[:, None], 3, axis=1)
-    return ImageLandmarks(corners, np.tile([1.0, 0.0, 0.0], (len(vertices), 1)), pixels)
+    weights = np.tile([1.0, 0.0, 0.0], (len(vertices), 1))
+    return ImageLandmarks(corners, weights, pixels, np.zeros((0, 2), np.int64))
 
 
 AZIMUTHS = (-40, -30, -20, -10, 0, 10, 20, 30, 40)
@@ -299,7 +311,10 @@ class NetworkLandmarks:
                         pixels[row, column] = np.where(facing[:, None], points, np.nan)
                         near = found
                         break
-        return ImageLandmarks(self._embedding.corners, self._embedding.weights, pixels)
+        place = {number: row for row, number in enumerate(self._embedding.landmarks.tolist())}
+        pairs = [[place[one], place[other]] for one, other in _PAIRS if one in place and other in place]
+        corners, weights = self._embedding.corners, self._embedding.weights
+        return ImageLandmarks(corners, weights, pixels, np.array(pairs, np.int64).reshape(-1, 2))
 
     def _facing(self, found: FloatArray, camera: int) -> BoolArray | None:
         """(L,) mask of landmarks that face the camera; None if they do not form a face."""

@@ -13,6 +13,7 @@ sampled with their gradients.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -160,15 +161,9 @@ class Occlusion:
     def visible(self, mesh: FloatArray, vertices: IntArray) -> FloatArray:
         """(C, n) cosine between normal and direction to the camera at vertices that are seen, else 0. ``mesh``: (V, 3)
         posed mesh, metres. ``vertices``: (n,) vertices."""
-        normals = vertex_normals(mesh, self._faces)[vertices]
-        points = mesh[vertices]
-        toward = self._views.centers[:, None] - points
-        cosine = np.einsum("cni,ni->cn", toward, normals) / np.linalg.norm(toward, axis=2)
-        surface = [mesh] + [
-            np.einsum("sk,fki->fsi", shares, mesh[faces]).reshape(-1, 3) for faces, shares in self._samples
-        ]
-        nearest = self._buffer(np.concatenate(surface))
-        pixels, depth = self._views.place(points)
+        cosine = self.cosines(mesh)[:, vertices]
+        nearest = self._buffer(mesh)
+        pixels, depth = self._views.place(mesh[vertices])
         cells, inside = self._cells(pixels)
         rows = np.arange(len(cosine))[:, None]
         slope = np.sqrt(1 - np.minimum(cosine**2, 1)) / np.maximum(cosine, FACING)
@@ -176,8 +171,27 @@ class Occlusion:
         seen = inside & (depth < nearest[rows, cells] + margin) & (cosine > FACING)
         return np.where(seen, cosine, 0.0)
 
-    def _buffer(self, points: FloatArray) -> FloatArray:
-        """(C, cells) nearest depth."""
+    def cosines(self, mesh: FloatArray) -> FloatArray:
+        """(C, V) cosine between normal and direction to the camera at all vertices of a posed mesh (V, 3)."""
+        toward = self._views.centers[:, None] - mesh
+        normals = vertex_normals(mesh, self._faces)
+        return np.asarray(np.einsum("cni,ni->cn", toward, normals) / np.linalg.norm(toward, axis=2))
+
+    def at_border(self, mesh: FloatArray, points: FloatArray) -> BoolArray:
+        """(C, n) whether points (n, 3) are in the image and within a cell of the border of the mesh's projection."""
+        width, height = self._views.sizes.max(axis=0) // CELL + 1
+        covered = np.isfinite(self._buffer(mesh)).reshape(-1, height, width)
+        closed = np.stack([ndimage.binary_closing(one, np.ones((3, 3)), border_value=0) for one in covered])
+        inner = np.stack([ndimage.binary_erosion(one, np.ones((3, 3)), border_value=1) for one in closed])
+        cells, inside = self._cells(self._views.place(points)[0])
+        return inside & ~inner.reshape(len(inner), -1)[np.arange(len(inner))[:, None], cells]
+
+    def _buffer(self, mesh: FloatArray) -> FloatArray:
+        """(C, cells) nearest depth of a posed mesh (V, 3)."""
+        surface = [mesh] + [
+            np.einsum("sk,fki->fsi", shares, mesh[faces]).reshape(-1, 3) for faces, shares in self._samples
+        ]
+        points = np.concatenate(surface)
         width, height = self._views.sizes.max(axis=0) // CELL + 1
         pixels, depth = self._views.place(points)
         cells, inside = self._cells(pixels)
@@ -314,6 +328,16 @@ class PointRig:
         """The points are vertices."""
         weights = np.tile([1.0, 0.0, 0.0], (len(vertices), 1))
         return cls(head, np.repeat(vertices[:, None], 3, axis=1), weights, dtype)
+
+    def mixed(self, corners: IntArray, weights: FloatArray) -> PointRig:
+        """A rig of n mixtures of k of the points. ``corners``: (n, k). ``weights``: (n, k), rows sum to 1."""
+        rig = copy(self)
+        for name in ("_template", "_basis", "_correctives", "_skin", "_lids"):
+            values = getattr(self, name)
+            if values is not None:
+                mixture = np.einsum("nk,nk...->n...", weights.astype(values.dtype), values[corners])
+                setattr(rig, name, mixture)
+        return rig
 
     def points(self, shape: FloatArray, pose: FloatArray) -> FloatArray:
         """(P, 3) points in the world, metres, of shape (S,) and pose (D,)."""

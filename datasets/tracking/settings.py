@@ -15,7 +15,7 @@ from ..options import CaptureOptions, Cut
 
 WORK = ".track"
 """Its name in the folder of ``--out``."""
-TRACKER_VERSION = "2"
+TRACKER_VERSION = "3"
 """Part of the key of intermediate results; raise it when code of the tracker or the reader of videos changes them."""
 _NOTE = "README.txt"
 _TEXT = """headbench track continues from these files after an interruption and deletes them at the end.
@@ -46,6 +46,9 @@ def make_work_folder(folder: Path) -> None:
         write_text(folder / _NOTE, _TEXT)
 
 
+USUAL_FOCAL, FOCAL_SPREAD = 2.5, 0.35
+"""Prior of the focal length of a video: its median relative to the longer side of a frame, and the standard deviation of its logarithm.
+Published trackers of videos start at 1.5 to 4.9 times the longer side."""
 MASKLESS, BACKGROUND = "none", "background"
 """Values of --masks that are no folder."""
 
@@ -71,7 +74,7 @@ class VideoOptions:
     """Video: folder of label images (19 classes of CelebAMask-HQ) named as --masks: clothes are cut by them instead."""
 
     focal: float | None = None
-    """Video: focal length in pixels of its upright frames; default: estimated from the landmarks, which is inexact."""
+    """Video: focal length in pixels of its upright frames; default: estimated, which is inexact."""
 
     rate: float = 25.0
     """Video: maximum frame rate; frames of a faster video are skipped."""

@@ -27,8 +27,9 @@ from ..ga.writer import save_npz
 from ..head.geometry import fit_sphere
 from ..head.model import PosedSubject
 from ..open import open_clip
-from .fit import Fitter, HeadState
+from .fit import Fitter, HeadState, continuous, motion_spread, sampled_vertices, with_offset
 from .landmarks import ImageLandmarks, landmark_source
+from .outline import outline_of
 from .rig import FrameStack, PoseColumns, Views, outliers
 from .settings import TRACKER_VERSION
 
@@ -188,14 +189,16 @@ def track(
     *,
     notes: Mapping[str, Any] | None = None,
     store: Path | None = None,
+    seconds: float = 0.0,
     progress: Progress = no_progress,
 ) -> Tracked:
-    """Estimate shape and poses from images; recorded as a step. The static offset becomes zero.
+    """Estimate shape, static offset and poses from images; recorded as a step.
 
     Timesteps without landmarks, and those whose fit remains an outlier, are not in the clip that is returned.
 
     Neither shape, poses nor static offset of the clip are used, other than by ``source``. The shape is estimated with the
-    first timesteps, spread over the clip, and kept for the others.
+    first timesteps, spread over the clip, and kept for the others. ``seconds``: Time
+    between timesteps, where it is known: neighbours then differ little.
 
     ``cameras``: Cameras whose images are used; one is enough. ``source``: Finds landmarks. ``notes``: Recorded with the
     step. ``store``: Folder that keeps the fit of every part, which a later call with the same images and landmarks does not
@@ -235,9 +238,10 @@ def track(
         # Others give the colours of the points.
         others = sorted(good, key=lambda one: min(abs(one - timestep) for timestep in wrong))[:half]
         refitted = sorted([*wrong, *others])
-        again = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in refitted]))
+        marks = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in refitted]))
         part_progress = partial(_part_progress, progress, blocks + number, blocks + len(parts))
-        fits.fit(f"again-{number:05d}", refitted, again, wrong, part_progress)
+        fits.fit(f"again-{number:05d}", refitted, marks, wrong, part_progress)
+    fits.finish({timestep: pixels[timestep] for timestep in fits.poses}, landmarks, seconds, progress)
     last = fits.outliers()
     kept = sorted({*fits.poses} - last)
     report = TrackingReport(
@@ -261,7 +265,7 @@ def track(
         "track",
         parameters,
         shape=state.shape,
-        static_offset=np.zeros(np.shape(clip.head.template), np.float32),
+        static_offset=np.asarray(fits.offset, np.float32),
         poses=dict(zip(kept, tracked)),
     )
     return Tracked(derived, report)
@@ -285,38 +289,67 @@ def _part_progress(progress: Progress, part: int, parts: int, done: int, total: 
 
 @dataclass
 class _Fits:
-    """Fits of parts of a clip's timesteps with one shape, which the first part determines."""
+    """Fits of parts of a clip's timesteps with one shape and static offset, which the first part determines."""
 
     clip: CaptureClip
     cameras: list[str]
     views: Views
     store: Path | None
     shape: FloatArray | None = None
+    offset: FloatArray | None = None
     seconds: float = 0.0
+    textures: list[FloatArray] = field(default_factory=list)
     poses: dict[int, FloatArray] = field(default_factory=dict)
     """(D,) each."""
     residuals: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     def fit(
-        self, name: str, part: list[int], landmarks: ImageLandmarks, taken: list[int], progress: Progress
+        self,
+        name: str,
+        part: list[int],
+        landmarks: ImageLandmarks,
+        taken: list[int],
+        progress: Progress,
+        last: LastPass | None = None,
     ) -> None:
         """Fit timesteps, from their poses if there are any, and take the results of some of them."""
         start = np.stack([self.poses[timestep] for timestep in part]) if part[0] in self.poses else None
-        given = self.clip, self.cameras, self.views, part, landmarks, self.shape, start, progress
+        given = (
+            *(self.clip, self.cameras, self.views, part, landmarks),
+            *(self.shape, self.offset, start, last, progress),
+        )
         if self.store is None:
             fitted = _fit_block(*given)
         else:
             seen = [[one.id, one.width, one.height, one.K, one.world_to_camera] for one in self.views.cameras]
             heads = self.clip.fingerprint, self.clip.head.fingerprint()
-            mark = digest(TRACKER_VERSION, *heads, seen, part, *landmarks, self.shape, start)
+            mark = digest(
+                TRACKER_VERSION, *heads, seen, part, *landmarks, self.shape, self.offset, start, *(last or ())
+            )
             file = self.store / f"{name}.npz"
             fitted = cached_arrays(file, mark, _PART, lambda: _fit_block(*given), {"T": len(part)})
-        self.shape = fitted["shape"]
+        self.shape, self.offset = fitted["shape"], fitted["offset"]
+        self.textures.append(fitted["texture"])
         self.seconds += float(fitted["seconds"])
         rows = zip(part, fitted["poses"], fitted["landmarks"].tolist(), fitted["colours"].tolist())
         for timestep, pose, *residual in rows:
             if timestep in taken:
                 self.poses[timestep], self.residuals[timestep] = pose, (residual[0], residual[1])
+
+    def finish(
+        self, pixels: Mapping[int, FloatArray], landmarks: ImageLandmarks, seconds: float, progress: Progress
+    ) -> None:
+        """Fit consecutive timesteps together, with the colours of all parts and small differences between neighbours."""
+        known = sorted({*self.poses} - self.outliers())
+        total = np.maximum(np.sum([one[:, 3:] for one in self.textures], axis=0), 1e-9)
+        colours = np.sum([one[:, :3] * one[:, 3:] for one in self.textures], axis=0) / total
+        texture = np.concatenate([colours, total], axis=1)
+        most = max(1, int(MOST_PIXELS / 4 // self.views.sizes.prod(axis=1).sum()))
+        parts = [part.tolist() for part in np.array_split(known, -(-len(known) // most) or 1) if len(part)]
+        for number, part in enumerate(parts):
+            marks = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in part]))
+            part_progress = partial(_part_progress, progress, number, len(parts))
+            self.fit(f"last-{number:05d}", part, marks, part, part_progress, LastPass(texture, seconds))
 
     def outliers(self) -> set[int]:
         """Timesteps whose fit is one of `outliers`."""
@@ -329,10 +362,21 @@ class _Fits:
 
 _PART = {
     "shape": Member("f", ("S",)),
+    "offset": Member("f", ("V", 3)),
+    "texture": Member("f", ("P", 4)),
     "poses": Member("f", ("T", "D")),
     **dict.fromkeys(("landmarks", "colours"), Member("f", ("T",))),
     "seconds": Member("f", ()),
 }
+
+
+class LastPass(NamedTuple):
+    """Inputs of the final pass over consecutive timesteps."""
+
+    texture: FloatArray
+    """(P, 4) as `Fitted.texture`."""
+    seconds: float
+    """Between timesteps; 0 where it is not known."""
 
 
 def _fit_block(
@@ -342,20 +386,33 @@ def _fit_block(
     part: Sequence[int],
     landmarks: ImageLandmarks,
     shape: FloatArray | None,
+    offset: FloatArray | None,
     poses: FloatArray | None,
+    last: LastPass | None,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
-    """Fit some timesteps with a given or a newly estimated shape, from given poses or from those of the landmarks.
+    """Fit some timesteps with a given or a newly estimated shape and offset, from given poses or from those of the landmarks.
     Returns the arrays of `_PART`."""
     begin = time.perf_counter()
-    fitter = Fitter(clip.head, views, landmarks)
-    images = [clip.image(clip.frame_at[timestep, name]) for timestep in part for name in cameras]
-    keep = shape is not None
-    state = fitter.start(shape) if shape is None or poses is None else HeadState(shape, poses)
-    state = fitter.fit_landmarks(state, keep_shape=keep)
-    fitted = fitter.fit_colours(state, FrameStack(images), keep_shape=keep, progress=progress)
+    keys = [clip.frame_at[timestep, name] for timestep in part for name in cameras]
+    masks = [clip.mask(key) for key in keys]
+    outlines = [None if mask is None else outline_of(mask) for mask in masks]
+    stack = FrameStack([clip.image(key) for key in keys])
+    head = clip.head if offset is None else with_offset(clip.head, offset)
+    fitter = Fitter(head, views, landmarks, sampled_vertices(clip.head), outlines)
+    if last is not None and shape is not None and poses is not None:
+        state = HeadState(shape, continuous(poses))
+        motion = motion_spread(part, last.seconds, state.poses.shape[1]) if last.seconds else None
+        assert offset is not None
+        fitted = fitter.fit_colours(state, stack, last=(last.texture, motion), progress=progress)
+    else:
+        state = fitter.start(shape) if shape is None or poses is None else HeadState(shape, poses)
+        state = fitter.fit_landmarks(state, keep_shape=shape is not None)
+        fitted, offset = fitter.fit(state, stack, offset, progress)
     return {
         "shape": fitted.state.shape,
+        "offset": offset,
+        "texture": fitted.texture,
         "poses": fitted.state.poses,
         "landmarks": fitted.landmarks,
         "colours": fitted.colours,
@@ -399,10 +456,15 @@ def with_tracking(
             tracked = track(capture, cameras, source, progress=report).clip
         timesteps = sorted(tracked.poses)
         rows = columns.rows([tracked.poses[timestep] for timestep in timesteps])
-        save_npz(place, {"shape": np.asarray(tracked.shape), "poses": rows, "timesteps": np.array(timesteps)})
-    members = {"shape": Member("f", ("S",), MAX_MAGNITUDE), "poses": Member("f", ("T", "D"), MAX_MAGNITUDE)}
-    members["timesteps"] = Member("i", ("T",))
-    sizes = {"S": capture.head.shape_basis.shape[2], "D": columns.size}
+        arrays = {"shape": np.asarray(tracked.shape), "offset": np.asarray(tracked.static_offset)}
+        save_npz(place, {**arrays, "poses": rows, "timesteps": np.array(timesteps)})
+    members = {
+        "shape": Member("f", ("S",), MAX_MAGNITUDE),
+        "offset": Member("f", ("V", 3), MAX_MAGNITUDE),
+        "poses": Member("f", ("T", "D"), MAX_MAGNITUDE),
+        "timesteps": Member("i", ("T",)),
+    }
+    sizes = {"S": capture.head.shape_basis.shape[2], "D": columns.size, "V": len(capture.head.template)}
     stored = read_arrays(place, members, sizes)
     timesteps = stored["timesteps"].tolist()
     poses = dict(zip(timesteps, columns.poses(stored["poses"], capture.head, capture.subject, timesteps)))
@@ -413,9 +475,9 @@ def with_tracking(
     train = tuple(key for key in capture.splits["train"] if key.timestep in timesteps)
     return capture.derive(
         "track",
-        {**settings, "parameters": digest(stored["shape"], stored["poses"])},
+        {**settings, "parameters": digest(stored["shape"], stored["offset"], stored["poses"])},
         shape=stored["shape"],
-        static_offset=np.zeros(capture.head.template.shape, np.float32),
+        static_offset=stored["offset"],
         poses=poses,
         splits={**capture.splits, "train": train},
     )

@@ -35,7 +35,7 @@ from ..head.arrays import HeadArrays
 from ..head.model import resting
 from ..images import read_mask, write_image
 from ..monocular.clip import VIDEO, Track, VideoFrame, check_subject, clip_of_track, subject_of
-from ..tracking.settings import BACKGROUND, MASKLESS, TRACKER_VERSION, VideoOptions
+from ..tracking.settings import BACKGROUND, MASKLESS, TRACKER_VERSION, USUAL_FOCAL, VideoOptions
 from .decode import TimedFrame, VideoInfo, probe_video, video_frames
 from .faces import BELOW, Crop, FaceFinder, FoundFaces, crop_around, find_faces
 
@@ -261,8 +261,6 @@ class MaskSource:
 
 
 FACES, IMAGES, MASKS = "faces.npz", "images", "masks"
-USUAL_FOCAL = 1.0
-"""Default focal length relative to the longer side of a frame: about that of phones' main cameras and webcams."""
 DISTANCE = 1.0  # of the head before it is tracked, metres
 
 

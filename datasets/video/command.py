@@ -20,7 +20,7 @@ from ..head.refit.command import target_head
 from ..tracking.fit import FocalLength, estimate_focal
 from ..tracking.landmarks import Embedding, NetworkLandmarks, head_embedding
 from ..tracking.settings import TRACKER_VERSION, make_work_folder
-from .clip import USUAL_FOCAL, FrameView, VideoClip, open_video
+from .clip import FrameView, VideoClip, open_video
 from .faces import LEAST_SEEN, REMEDY, FaceFinder
 
 if TYPE_CHECKING:
@@ -41,6 +41,8 @@ class OpenedVideo(NamedTuple):
     """Name of the file of the landmark network."""
     numbers: list[int]
     """Numbers in the file of the frames of the clip."""
+    seconds: float
+    """Between timesteps of the clip."""
     data: dict[str, Any]
     lines: list[str]
 
@@ -87,15 +89,15 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
             },
         )
         focal = FocalLength(float(stored["pixels"]), stored["residuals"], stored["tried"])
-        if focal.clear:
-            clip = video.with_focal(focal.pixels / video.view.scale)
-            landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
+        clip = video.with_focal(focal.pixels / video.view.scale)
+        landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
     return OpenedVideo(
         clip,
         video.view,
         landmarks,
         network.name,
         video.faces.numbers[video.faces.found].tolist(),
+        1 / min(settings.rate, video.info.rate),
         _data(video, settings.focal, focal),
         _lines(video, settings.focal, focal),
     )
@@ -128,10 +130,7 @@ def _focal(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
     """Focal length in pixels of the video, and its source."""
     if focal is None:
         return given or 0.0, "given"
-    if focal.clear:
-        return focal.pixels / video.view.scale, "estimated from landmarks"
-    usual = USUAL_FOCAL * max(video.info.width, video.info.height)
-    return usual, "assumed, since the landmarks do not determine it; give --focal if you know it"
+    return focal.pixels / video.view.scale, focal.source
 
 
 def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> list[str]:

@@ -83,6 +83,7 @@ def refit_capture(settings: RefitCommandSettings, progress: Progress = no_progre
 
 def target_head(name: str, option: str = "--target") -> HeadArrays:
     """The head model that an option names: a version of the procedural head, or a file."""
+    from ..arrays import with_derived_regions
     from ..loaders import load_head
     from ..procedural.model import procedural_head
     from ..procedural.surface import PACKAGED
@@ -90,7 +91,7 @@ def target_head(name: str, option: str = "--target") -> HeadArrays:
 
     short = [version.removeprefix("procedural") for version in VERSIONS]
     if name in (*short, *VERSIONS):
-        return procedural_head(name)
+        return with_derived_regions(procedural_head(name))
     surface = Path(name).parts[-2:] == PACKAGED.parts[-2:]  # from which the procedural heads are made
     if surface or not Path(name).exists():
         expected = f"{', '.join(short)} or the file of a head model"

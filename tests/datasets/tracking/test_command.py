@@ -3,6 +3,8 @@
 import json
 import os
 
+import numpy as np
+
 import pytest
 
 from headbench.bench.errors import InputError
@@ -27,7 +29,7 @@ def test_the_tracked_capture_reads_back(finished, patterned_capture):
         n: set(k) for n, k in old.splits.items()
     }
     assert all(os.path.samefile(file.image, new.files[key].image) for key, file in old.files.items())
-    assert not new.static_offset.any()
+    assert 0 < np.abs(new.static_offset).max() < 0.04
     assert any(abs(new.poses[t].translation - old.poses[t].translation).max() > 1e-5 for t in old.poses)
 
 

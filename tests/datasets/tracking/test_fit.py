@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from headbench.datasets.head.model import HeadModel
-from headbench.datasets.tracking.fit import HeadPrior, HeadState, NormalEquations
+from headbench.datasets.tracking.fit import HeadPrior, HeadState, NormalEquations, continuous
 from headbench.datasets.tracking.rig import ANGLES, PointRig, PoseColumns, PosedPoints
 
 from ..head.toy import toy_head
@@ -65,7 +66,7 @@ def test_the_step_solves_the_whole_system():
     timesteps, poses, shapes, points = 3, 4, 2, 6
     state = HeadState(rng.standard_normal(shapes), rng.standard_normal((timesteps, poses)))
     prior = HeadPrior(np.array([np.inf, 0.5, 1.0, 2.0]), np.array([0.3, 3.0]))
-    equations = NormalEquations(timesteps, poses, shapes)
+    equations = NormalEquations(state)
     size = timesteps * poses + shapes
     whole, right = np.zeros((size, size)), np.zeros(size)
     for row in range(timesteps):
@@ -90,12 +91,51 @@ def test_the_step_solves_the_whole_system():
     np.testing.assert_allclose(np.concatenate([found.poses.ravel(), found.shape]), wanted, atol=1e-6)
 
 
+def test_linked_poses_solve_the_whole_system():
+    rng = np.random.default_rng(3)
+    timesteps, poses, points = 5, 4, 6
+    state = HeadState(np.zeros(1), rng.standard_normal((timesteps, poses)))
+    prior = HeadPrior(np.array([np.inf, 0.5, 1.0, 2.0]), np.zeros(1))
+    equations = NormalEquations(state)
+    size = timesteps * poses
+    whole, right = np.zeros((size, size)), np.zeros(size)
+    for row in range(timesteps):
+        place = slice(row * poses, (row + 1) * poses)
+        jacobian, weight = rng.standard_normal((points, poses + 1)), rng.uniform(1, 2, points)
+        residual = rng.standard_normal(points)
+        equations.add_residuals(row, jacobian, weight, residual)
+        whole[place, place] += (jacobian.T * weight @ jacobian)[:poses, :poses]
+        right[place] += (jacobian.T @ (weight * residual))[:poses]
+    deviations = rng.uniform(0.1, 1.0, (timesteps - 1, poses))
+    deviations[2] = np.inf
+    equations.link(state.poses, deviations)
+    difference = np.zeros(((timesteps - 1) * poses, size))
+    rows = np.arange(len(difference))
+    difference[rows, rows], difference[rows, rows + poses] = -1, 1
+    stiff = np.concatenate([1 / prior.pose**2] * timesteps)
+    linked = difference.T * deviations.ravel() ** -2.0 @ difference
+    values = state.poses.ravel()
+    change = np.linalg.solve(whole + linked + np.diag(stiff), right - linked @ values - stiff * values)
+    found = equations.step(state, prior, damping=0.0)
+    np.testing.assert_allclose(found.poses.ravel(), values + change, atol=1e-6)
+
+
+def test_rotation_vectors_are_continuous_at_half_a_turn():
+    angles = np.linspace(np.pi - 0.3, np.pi + 0.3, 7)
+    turned = Rotation.from_rotvec(angles[:, None] * [1.0, 0.0, 0.0])
+    poses = np.concatenate([turned.as_rotvec(), np.ones((7, 2))], axis=1)
+    assert np.abs(np.diff(poses[:, 0])).max() > 3
+    found = continuous(poses)
+    np.testing.assert_allclose(found[:, 0], angles, atol=1e-9)
+    np.testing.assert_array_equal(found[:, 3:], poses[:, 3:])
+
+
 def test_a_prior_of_0_keeps_a_parameter():
     rng = np.random.default_rng(2)
-    equations = NormalEquations(1, 2, 1)
+    state = HeadState(np.array([0.7]), np.array([[0.2, 0.3]]))
+    equations = NormalEquations(state)
     posed = PosedPoints(*(rng.standard_normal(size) for size in ((4, 3), (4, 3, 2), (4, 3, 1))))
     equations.add(0, posed, np.tile(np.eye(3), (4, 1, 1)), rng.standard_normal((4, 3)))
-    state = HeadState(np.array([0.7]), np.array([[0.2, 0.3]]))
     found = equations.step(state, HeadPrior(np.array([np.inf, 0.0]), np.zeros(1)))
     assert found.shape[0] == 0.7
     assert found.poses[0, 1] == 0.3

@@ -14,7 +14,7 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.tracking import track as track_module
-from headbench.datasets.tracking.fit import Fitter
+from headbench.datasets.tracking.fit import Fitter, sampled_vertices
 from headbench.datasets.tracking.landmarks import known_rig_landmarks, spread_vertices
 from headbench.datasets.tracking.rig import FrameStack, PoseColumns, Views, outliers
 from headbench.datasets.tracking.track import (
@@ -73,7 +73,10 @@ def by_landmarks(clip, cameras):
     """The clip as landmarks alone track it."""
     timesteps = sorted(clip.poses)
     fitter = Fitter(
-        clip.head, Views([clip.cameras[name] for name in cameras]), source(clip, cameras)(timesteps)
+        clip.head,
+        Views([clip.cameras[name] for name in cameras]),
+        source(clip, cameras)(timesteps),
+        sampled_vertices(clip.head),
     )
     state = fitter.fit_landmarks(fitter.start())
     poses = PoseColumns.of(clip.head).poses(state.poses, clip.head, clip.subject, timesteps)
@@ -85,7 +88,7 @@ def test_colours_correct_landmarks(clip, tracked):
     before, after = skin_errors(by_landmarks(clip, [*clip.cameras]), clip), skin_errors(tracked.clip, clip)
     assert after.motion < 0.5 * before.motion
     assert after.absolute < before.absolute
-    assert not tracked.clip.static_offset.any()
+    assert 0 < np.abs(tracked.clip.static_offset).max() < 0.04
     assert [residual.timestep for residual in tracked.report.residuals] == sorted(clip.poses)
     assert tracked.clip.steps[-1].name == "track"
 
