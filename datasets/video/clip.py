@@ -38,6 +38,7 @@ from ..monocular.clip import VIDEO, Track, VideoFrame, check_subject, clip_of_tr
 from ..tracking.settings import BACKGROUND, MASKLESS, TRACKER_VERSION, USUAL_FOCAL, VideoOptions
 from .decode import TimedFrame, VideoInfo, probe_video, video_frames
 from .faces import BELOW, Crop, FaceFinder, FoundFaces, crop_around, find_faces
+from .matting import refined_mask, without_room
 
 SAMPLES, LEAST_EMPTY = 60, 10
 """Maximum and minimum number of frames of the empty room from which the background is learnt."""
@@ -243,16 +244,19 @@ class MaskSource:
         )
 
     def mask(self, frame: TimedFrame, view: FrameView, face: FloatArray) -> ByteArray:
-        """(H, W) 8-bit coverage of the person in the view of a frame with landmarks ``face``, (L, 2) pixels of the frame."""
+        """(H, W) 8-bit coverage of the person in the view of a frame with landmarks ``face``, (L, 2) pixels of the frame.
+        Masks of files are not refined."""
+        if self._network is None and self._background is None:
+            return view.image(
+                read_mask(self._mask_file(frame.number), (frame.image.shape[1], frame.image.shape[0]))
+            )
+        image, points = view.image(frame.image), view.points(face)
         if self._network is not None:
-            return self._network.mask(view.image(frame.image))  # where the person is larger than in the frame
-        if self._background is not None:
-            found = self._background.mask(view.image(frame.image), view.points(face))
-            self.unsure[frame.number] = found.unsure
-            return found.mask
-        return view.image(
-            read_mask(self._mask_file(frame.number), (frame.image.shape[1], frame.image.shape[0]))
-        )
+            coarse = self._network.mask(image)  # where the person is larger than in the frame
+        else:
+            assert self._background is not None
+            coarse, self.unsure[frame.number] = self._background.mask(image, points)
+        return refined_mask(image, coarse, points)
 
     def _mask_file(self, number: int) -> Path:
         names = [f"{number:0{digits}d}{suffix}" for digits in (5, 4) for suffix in (".png", ".jpg")]
@@ -367,7 +371,8 @@ def _write_frames(
             continue
         pictures = [view.image(frame.image)]
         if masks:
-            pictures.append(masks.mask(frame, view, seen[frame.number]))
+            mask = masks.mask(frame, view, seen[frame.number])
+            pictures = [without_room(pictures[0], mask), mask]
         for file, picture in zip(files[frame.number], pictures):
             if not file.exists():
                 write_image(file, picture)
