@@ -70,8 +70,11 @@ def test_a_static_offset_follows_the_scalp_and_keeps_the_eyes(head, camera):
     mesh = np.asarray(head.template, np.float64)
     (points,) = MeshOutline(head, mesh, Views([camera]), scalp=True).points(mesh)
     hair = np.isin(points.corners, head.regions["scalp"]).all(axis=1)
-    chosen = OutlinePoints(points.corners[hair], points.weights[hair])
-    offset = static_offset(head, mesh, chosen, np.full(hair.sum(), 0.01))
+    frames = 64
+    chosen = OutlinePoints(
+        np.tile(points.corners[hair], (frames, 1)), np.tile(points.weights[hair], (frames, 1))
+    )
+    offset = static_offset(head, mesh, chosen, np.full(len(chosen.corners), 0.01))
     moved = (offset * vertex_normals(mesh, head.faces)).sum(axis=1)
     reached = np.einsum("nk,nk->n", chosen.weights, moved[chosen.corners])
     assert 0.008 < np.median(reached) < 0.0105
