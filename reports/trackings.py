@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Literal
@@ -12,9 +12,11 @@ import numpy as np
 import tyro
 
 from ..bench.condition import label_of
-from ..bench.contracts import FloatArray, Progress, no_progress
+from ..bench.contracts import FloatArray, FrameKey, Progress, no_progress
 from ..bench.errors import InputError
-from ..bench.protocol import TASK_TITLES, evenly
+from ..bench.io.files import digest
+from ..bench.progress import counted
+from ..bench.protocol import TASK_TITLES
 from ..bench.rows import FULL
 from ..bench.specs import CommandResult, MetricSpec, command
 from ..bench.terminal import table
@@ -22,11 +24,9 @@ from .aggregate import summarise
 from .runs import RunData
 from .writers import csv_text
 
-PICTURES, SAME = 4, 0.1
-"""Pictures of a task that are compared between captures, and the largest mean difference of the same picture, levels of 255."""
-REMEDY = (
-    "Make all captures with the same masks and with --cut none, since the bust line depends on the tracking."
-)
+LEAST = 0.9
+"""Minimum fraction of the scored frames of each run that all runs have."""
+REMEDY = "Make the captures from the images of one, as `headbench track CAPTURE` does."
 
 
 @dataclass(frozen=True)
@@ -116,9 +116,7 @@ class TrackingComparison:
 @command("report trackings", group="inspect")
 def tracking_runs(settings: TrackingsSettings, progress: Progress = no_progress) -> CommandResult:
     """Tell the error due to the tracking from that due to the method, from runs on several trackings."""
-    runs = [RunData.read(Path(folder)) for folder in settings.runs]
-    for run in runs[1:]:
-        _check_same(runs[0], run)
+    runs, counts = with_common_frames([RunData.read(Path(folder)) for folder in settings.runs])
     found = comparisons(runs, settings.metrics, settings.regions)
     data = [asdict(each) for each in found]
     if settings.format == "csv":
@@ -130,8 +128,8 @@ def tracking_runs(settings: TrackingsSettings, progress: Progress = no_progress)
         ]
         text = csv_text([("task", "region", "metric", "method", "tracking", "value"), *cells])
         return CommandResult(text, data, verbatim=True)
-    note = "Effects are of the trained methods. Regions are those of each capture's own tracking."
-    return CommandResult("\n\n".join([*(each.text() for each in found), note]), data)
+    notes = ["Effects are of the trained methods. Regions are those of each capture's own tracking.", *counts]
+    return CommandResult("\n\n".join([*(each.text() for each in found), "\n".join(notes)]), data)
 
 
 def comparisons(
@@ -180,9 +178,38 @@ def comparisons(
     return found
 
 
+def with_common_frames(runs: Sequence[RunData]) -> tuple[list[RunData], list[str]]:
+    """Runs of the same methods with the rows of frames whose pictures all have, and sentences on how many these are.
+
+    Trackers leave out frames, and captures number the others anew; so frames are identified by their pictures.
+    """
+    first, counts = runs[0], []
+    chosen: list[dict[str, list[FrameKey]]] = [{} for _ in runs]
+    for run in runs[1:]:
+        _check_same(first, run)
+    for task in first.tasks if len(runs) > 1 else ():
+        frames = [
+            {(key.subject, digest(run.ground_truth(key))): key for key in run.keys(task)} for run in runs
+        ]
+        common = set.intersection(*({*known} for known in frames))
+        for run, known, own in zip(runs, frames, chosen):
+            own[task] = [known[name] for name in common]
+            if len(common) < LEAST * len(known) or not common:
+                expected = f"pictures of which at least {LEAST:.0%} are scored in all runs"
+                found = f"{len(common)} of {len(known)}"
+                raise InputError(run.folder.root, f"pictures of {task}", expected, found, REMEDY)
+        most = max(len(known) for known in frames)
+        counts.append(
+            f"{TASK_TITLES.get(task, task)}: {len(common)} of {counted(most, 'frame')} in all runs."
+        )
+    if len(runs) > 1:
+        runs = [replace(run, rows=run.rows.of_frames(keys)) for run, keys in zip(runs, chosen)]
+    return [*runs], counts
+
+
 def _check_same(first: RunData, run: RunData) -> None:
-    """Raise `InputError` unless two runs have the same methods, frames and pictures."""
-    root, other = run.folder.root, f"those of {first.folder.root}"
+    """Raise `InputError` unless two runs have the same methods, tasks and definitions of metrics."""
+    other = f"those of {first.folder.root}"
     methods = [
         {record.name: (record.version, record.config, record.budget) for record in each.manifest.methods}
         for each in (first, run)
@@ -192,27 +219,9 @@ def _check_same(first: RunData, run: RunData) -> None:
         raise InputError(
             run.folder.manifest, "methods", f"{other}, with the same settings", f"another {differ[0]}"
         )
-    if first.tasks != run.tasks:
-        raise InputError(run.folder.manifest, "tasks", ", ".join(first.tasks), ", ".join(run.tasks))
-    for task in first.tasks:
-        keys = first.keys(task)
-        if {*keys} != {*run.keys(task)}:
-            found = f"{len({*run.keys(task)} - {*keys})} more and {len({*keys} - {*run.keys(task)})} fewer"
-            raise InputError(
-                root, f"frames of {task}", f"{other} ({len(keys)})", found, "Score the same frames."
-            )
-        if first.manifest.protocols[task].design != run.manifest.protocols[task].design:
-            raise InputError(
-                root, f"protocol of {task}", f"the size and settings of scoring of {other}", "others"
-            )
-        for key in evenly(keys, PICTURES):
-            one, two = first.ground_truth(key), run.ground_truth(key)
-            gap = float(np.abs(one.astype(np.int16) - two).mean())
-            if gap > SAME:
-                expected = f"{other}, from one video"
-                raise InputError(
-                    root, f"picture of {key}", expected, f"a mean difference of {gap:.2g} levels", REMEDY
-                )
+    protocols = [", ".join(one.id for one in each.manifest.protocols.values()) for each in (first, run)]
+    if protocols[0] != protocols[1]:
+        raise InputError(run.folder.manifest, "protocols", f"{other}: {protocols[0]}", protocols[1])
 
 
 def _text(value: float, number: str) -> str:

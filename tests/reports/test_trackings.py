@@ -15,13 +15,20 @@ VALUES = {"ga": (30.0, 26.0), "gbs": (28.0, 25.0), "mean-image": (20.0, 20.0)}
 
 
 @pytest.fixture
-def runs(write_run):
+def by_hand(write_run, monkeypatch):
+    """Write runs by hand, without pictures of their frames."""
+    monkeypatch.setattr(trackings, "with_common_frames", lambda runs: (runs, []))
+    return lambda *given: str(write_run(*given))
+
+
+@pytest.fixture
+def runs(by_hand):
     """Two runs with these values."""
-    folders = (
-        write_run(name, {method: both[number] for method, both in VALUES.items()})
-        for number, name in enumerate(("exact", "own"))
+    folders = ("exact", "own")
+    return tuple(
+        by_hand(name, {method: both[number] for method, both in VALUES.items()})
+        for number, name in enumerate(folders)
     )
-    return tuple(map(str, folders))
 
 
 def settings(runs, **changes):
@@ -58,8 +65,8 @@ def test_conditions_of_one_run_are_trackings(write_run):
     assert found["values"].tolist() == [[30.0, 27.0]]
 
 
-def test_methods_without_a_value_are_not_in_the_effects(write_run):
-    runs = str(write_run("a", {"ga": 30.0, "gbs": np.nan})), str(write_run("b", {"ga": 29.0, "gbs": 28.0}))
+def test_methods_without_a_value_are_not_in_the_effects(by_hand):
+    runs = by_hand("a", {"ga": 30.0, "gbs": np.nan}), by_hand("b", {"ga": 29.0, "gbs": 28.0})
     found = tracking_runs(settings(runs))
     assert found.data[0]["chosen"] == (0,)
     (line,) = {line for line in found.text.splitlines() if line.startswith("gbs")}
@@ -73,36 +80,45 @@ def test_csv_has_a_line_for_each_value(runs):
     assert wanted | {"value": "26.0"} in lines
 
 
-def test_runs_that_differ_in_more_are_refused(write_run, make_run, runs):
-    for other, found in (
-        (write_run("fewer", {"ga": 30.0, "mean-image": 20.0}), "another gbs"),
-        (write_run("set", dict.fromkeys(VALUES, 20.0), {"ga": {"a": 1}}), "another ga"),
-    ):
-        with pytest.raises(InputError, match=found):
-            tracking_runs(settings((runs[0], str(other))))
-    for changes, message in (
-        ({"metrics": ("jod",)}, "--metrics.*jod"),
-        ({"regions": ("nose",)}, "--regions.*nose"),
+def test_names_and_numbers_of_runs_are_checked(runs):
+    for given, changes, message in (
+        (runs, {"metrics": ("jod",)}, "--metrics.*jod"),
+        (runs, {"regions": ("nose",)}, "--regions.*nose"),
+        (runs[:1], {}, "two trackings"),
+        (runs[:1] * 2, {}, "each run once"),
     ):
         with pytest.raises(InputError, match=message):
-            tracking_runs(settings(runs, **changes))
-    with pytest.raises(InputError, match="two trackings"):
-        tracking_runs(settings(runs[:1]))
-    with pytest.raises(InputError, match="each run once"):
-        tracking_runs(settings((runs[0], runs[0])))
-    folders = str(make_run("two")), str(make_run("one", subjects=("subject1",)))
-    with pytest.raises(InputError, match="frames of novel_view.*0 more and"):
+            tracking_runs(settings(given, **changes))
+
+
+def test_runs_of_other_methods_or_protocols_are_refused(make_run, change_manifest):
+    folders = [make_run("first"), make_run("second")]
+    change_manifest(folders[1], lambda manifest: manifest["methods"][0]["budget"].update(iterations=3))
+    with pytest.raises(InputError, match="another toy"):
+        tracking_runs(settings(folders, metrics=("error",)))
+    folders[1] = make_run("third", tasks=("novel_view",))
+    with pytest.raises(InputError, match=r"protocols.*self_reenactment"):
         tracking_runs(settings(folders, metrics=("error",)))
 
 
-def test_captures_must_have_the_same_pictures(make_run, monkeypatch):
+def test_frames_are_matched_by_their_pictures(make_run, monkeypatch):
     folders = str(make_run("first")), str(make_run("second"))
-    assert tracking_runs(settings(folders, metrics=("error",))).data[0]["trackings"] == ("first", "second")
-    picture = RunData.ground_truth
-    monkeypatch.setattr(
-        trackings.RunData,
-        "ground_truth",
-        lambda run, key: picture(run, key) ^ np.uint8(run.folder.root.name == "second"),
-    )
-    with pytest.raises(InputError, match="(?s)mean difference of 1 levels.*--cut none"):
-        tracking_runs(settings(folders, metrics=("error",)))
+    given = settings(folders, metrics=("error",))
+    count = len(RunData.read(folders[0]).keys("novel_view"))
+    picture, changed = RunData.ground_truth, set()
+
+    def ground_truth(run, key):
+        return picture(run, key) ^ np.uint8(run.folder.root.name == "second" and key in changed)
+
+    monkeypatch.setattr(RunData, "ground_truth", ground_truth)
+    plain = tracking_runs(given)
+    assert plain.data[0]["trackings"] == ("first", "second")
+    assert f"Novel view: {count} of {count} frames in all runs." in plain.text
+    monkeypatch.setattr(trackings, "LEAST", 0.1)
+    changed.add(RunData.read(folders[0]).keys("novel_view")[0])
+    fewer = tracking_runs(given)
+    assert f"Novel view: {count - 1} of {count} frames in all runs." in fewer.text
+    assert not np.array_equal(plain.data[0]["values"], fewer.data[0]["values"])
+    monkeypatch.setattr(trackings, "LEAST", 1.0)
+    with pytest.raises(InputError, match=f"pictures of novel_view.*{count - 1} of {count}"):
+        tracking_runs(given)
