@@ -16,12 +16,12 @@ from ..bench.contracts import FloatArray, FrameKey, Progress, no_progress
 from ..bench.errors import InputError
 from ..bench.io.files import digest
 from ..bench.progress import counted
-from ..bench.protocol import TASK_TITLES
+from ..bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
 from ..bench.rows import FULL
 from ..bench.specs import CommandResult, MetricSpec, command
 from ..bench.terminal import table
 from .aggregate import summarise
-from .runs import RunData
+from .runs import SPLIT_TASK, RunData, unseen_cameras
 from .writers import csv_text
 
 LEAST = 0.9
@@ -128,14 +128,19 @@ def tracking_runs(settings: TrackingsSettings, progress: Progress = no_progress)
         ]
         text = csv_text([("task", "region", "metric", "method", "tracking", "value"), *cells])
         return CommandResult(text, data, verbatim=True)
-    notes = ["Effects are of the trained methods. Regions are those of each capture's own tracking.", *counts]
+    missing = {*settings.metrics} - {each.metric.name for each in found}
+    notes = [f"Not measured: {', '.join(sorted(missing))}."] if missing else []
+    notes += [
+        "Effects are of the trained methods. Regions are those of each capture's own tracking.",
+        *counts,
+    ]
     return CommandResult("\n\n".join([*(each.text() for each in found), "\n".join(notes)]), data)
 
 
 def comparisons(
     runs: Sequence[RunData], metrics: Sequence[str], regions: Sequence[str]
 ) -> list[TrackingComparison]:
-    """One for each task, region and metric, of runs with the same frames and methods."""
+    """One for each task, region and metric with any value, of runs with the same frames and methods."""
     first, found = runs[0], []
     specs = {spec.name: spec for spec in first.manifest.metrics if spec.per_frame}
     for option, given, valid in (
@@ -157,9 +162,18 @@ def comparisons(
         raise InputError("command line", "runs", "two trackings: two runs, or one with conditions", names[0])
     trivial = {record.name: record.trivial for record in first.manifest.methods}
     methods = sorted(trivial, key=trivial.__getitem__)
+    unseen, _ = unseen_cameras([run.manifest for run in runs], first.keys(SPLIT_TASK))
+    tasks = [
+        part
+        for task in first.tasks
+        for part in ((SEEN_CAMERAS, UNSEEN_CAMERAS) if unseen and task == SPLIT_TASK else (task,))
+    ]
     for region in regions:
         parts = [(rows.of_part(region, (), FULL), condition) for rows, condition in columns]
-        for task, metric in product(first.tasks, metrics):
+        if unseen:
+            split = SPLIT_TASK, unseen, UNSEEN_CAMERAS, SEEN_CAMERAS
+            parts = [(rows.split_by_camera(*split), condition) for rows, condition in parts]
+        for task, metric in product(tasks, metrics):
             values = np.array(
                 [
                     [summarise(rows, label_of(method, name), metric, task).value for rows, name in parts]
@@ -167,6 +181,8 @@ def comparisons(
                 ],
                 float,
             )
+            if not np.isfinite(values).any():
+                continue  # no value on any tracking
             present = np.isfinite(values).all(axis=1)
             chosen = tuple(i for i, method in enumerate(methods) if present[i] and not trivial[method])
             effects = Effects.of(values[[*chosen]]) if chosen else None

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
+from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from headbench.reports import trackings
 from headbench.reports.runs import RunData
 from headbench.reports.trackings import Effects, TrackingsSettings, tracking_runs
@@ -71,6 +72,8 @@ def test_methods_without_a_value_are_not_in_the_effects(by_hand):
     assert found.data[0]["chosen"] == (0,)
     (line,) = {line for line in found.text.splitlines() if line.startswith("gbs")}
     assert line.split() == ["gbs", "-", "28.0000", "-"]
+    runs = by_hand("c", {"ga": np.nan}), by_hand("d", {"ga": np.nan})
+    assert tracking_runs(settings(runs)).text.startswith("Not measured: psnr.")
 
 
 def test_csv_has_a_line_for_each_value(runs):
@@ -78,6 +81,14 @@ def test_csv_has_a_line_for_each_value(runs):
     assert len(lines) == 2 * 3 * 2
     wanted = {"task": "novel_view", "region": "full", "metric": "psnr", "method": "ga", "tracking": "own"}
     assert wanted | {"value": "26.0"} in lines
+
+
+def test_cameras_that_were_seen_in_training_are_a_task_of_their_own(by_hand, monkeypatch):
+    runs = by_hand("a", {"ga": 30.0}), by_hand("b", {"ga": 29.0})
+    seen = frozenset((subject, "a") for subject in "ab"), ""
+    monkeypatch.setattr(trackings, "unseen_cameras", lambda manifests, keys: seen)
+    tasks = [each["task"] for each in tracking_runs(settings(runs)).data]
+    assert tasks == ["novel_view", SEEN_CAMERAS, UNSEEN_CAMERAS]
 
 
 def test_names_and_numbers_of_runs_are_checked(runs):
