@@ -81,6 +81,9 @@ class TrackingComparison:
     metric: MetricSpec
     trackings: tuple[str, ...]
     methods: tuple[str, ...]
+    """Trivial baselines last."""
+    trained: int
+    """Number of the methods that are no trivial baselines."""
     values: FloatArray
     """(methods, trackings), NaN where missing."""
     chosen: tuple[int, ...]
@@ -91,6 +94,7 @@ class TrackingComparison:
     def text(self) -> str:
         """The table, and below it a sentence on the effects."""
         number, unit = f".{self.metric.digits}f", f" {self.metric.unit}".rstrip()
+        signed = f"+z{number}"
         spans = self.values.max(axis=1) - self.values.min(axis=1)
         lines = [
             [name, *(_text(value, number) for value in (*row, span)), ""]
@@ -99,18 +103,19 @@ class TrackingComparison:
         below = "No trained method has a value on every tracking."
         if effects := self.effects:
             for index, effect in zip(self.chosen, effects.methods):
-                lines[index][-1] = f"{effect:+{number}}"
+                lines[index][-1] = f"{effect:{signed}}"
             means = effects.mean + effects.trackings
-            lines.append(["mean", *(_text(value, number) for value in (*means, np.ptp(means))), ""])
-            lines.append(
-                ["due to tracking", *(f"{effect:+{number}}" for effect in effects.trackings), "", ""]
-            )
+            mean = ["mean", *(_text(value, number) for value in (*means, np.ptp(means))), ""]
+            due = ["due to tracking", *(f"{effect:{signed}}" for effect in effects.trackings), "", ""]
+            lines[self.trained : self.trained] = [mean, due]
             sizes = np.ptp(means), np.ptp(effects.methods), np.abs(effects.remainder).max()
             parts = [f"{size:{number}}{unit} ({share:.0%}" for size, share in zip(sizes, effects.shares)]
             below = f"Trackings differ by {parts[0]} of the variance), methods by {parts[1]}); remainder at most {parts[2]})."
-        where = f"{TASK_TITLES.get(self.task, self.task)}, {'whole frames' if self.region == FULL else self.region}"
+        part = "whole frames" if self.region == FULL else self.region
+        title = f"{TASK_TITLES.get(self.task, self.task)}, {part}: {self.metric.label}"
+        title += f" ({self.metric.unit})" if unit else ""
         head = ["Method", *self.trackings, "range", "due to method"]
-        return f"{table(head, lines, title=f'{where}: {self.metric.label}{unit}')}\n{below}"
+        return f"{table(head, lines, title=title)}\n{below}"
 
 
 @command("report trackings", group="inspect")
@@ -161,7 +166,7 @@ def comparisons(
     if len(names) < 2:
         raise InputError("command line", "runs", "two trackings: two runs, or one with conditions", names[0])
     trivial = {record.name: record.trivial for record in first.manifest.methods}
-    methods = sorted(trivial, key=trivial.__getitem__)
+    methods, trained = sorted(trivial, key=trivial.__getitem__), len(trivial) - sum(trivial.values())
     unseen, _ = unseen_cameras([run.manifest for run in runs], first.keys(SPLIT_TASK))
     tasks = [
         part
@@ -184,11 +189,11 @@ def comparisons(
             if not np.isfinite(values).any():
                 continue  # no value on any tracking
             present = np.isfinite(values).all(axis=1)
-            chosen = tuple(i for i, method in enumerate(methods) if present[i] and not trivial[method])
+            chosen = tuple(np.flatnonzero(present[:trained]).tolist())
             effects = Effects.of(values[[*chosen]]) if chosen else None
             found.append(
                 TrackingComparison(
-                    task, region, specs[metric], (*names,), (*methods,), values, chosen, effects
+                    task, region, specs[metric], (*names,), (*methods,), trained, values, chosen, effects
                 )
             )
     return found

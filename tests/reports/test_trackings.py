@@ -83,7 +83,7 @@ def test_csv_has_a_line_for_each_value(runs):
     assert wanted | {"value": "26.0"} in lines
 
 
-def test_cameras_that_were_seen_in_training_are_a_task_of_their_own(by_hand, monkeypatch):
+def test_cameras_seen_in_training_are_a_task(by_hand, monkeypatch):
     runs = by_hand("a", {"ga": 30.0}), by_hand("b", {"ga": 29.0})
     seen = frozenset((subject, "a") for subject in "ab"), ""
     monkeypatch.setattr(trackings, "unseen_cameras", lambda manifests, keys: seen)
