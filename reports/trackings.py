@@ -123,12 +123,12 @@ def tracking_runs(settings: TrackingsSettings, progress: Progress = no_progress)
     """Tell the error due to the tracking from that due to the method, from runs on several trackings."""
     runs, counts = with_common_frames([RunData.read(Path(folder)) for folder in settings.runs])
     found = comparisons(runs, settings.metrics, settings.regions)
-    data = [asdict(each) for each in found]
+    data = [asdict(each) | {"values": _numbers(each.values)} for each in found]
     if settings.format == "csv":
         cells = [
-            (each.task, each.region, each.metric.name, method, tracking, "" if np.isnan(value) else value)
+            (each.task, each.region, each.metric.name, method, tracking, value)
             for each in found
-            for method, row in zip(each.methods, each.values.tolist())
+            for method, row in zip(each.methods, _numbers(each.values))
             for tracking, value in zip(each.trackings, row)
         ]
         text = csv_text([("task", "region", "metric", "method", "tracking", "value"), *cells])
@@ -243,6 +243,10 @@ def _check_same(first: RunData, run: RunData) -> None:
     protocols = [", ".join(one.id for one in each.manifest.protocols.values()) for each in (first, run)]
     if protocols[0] != protocols[1]:
         raise InputError(run.folder.manifest, "protocols", f"{other}: {protocols[0]}", protocols[1])
+
+
+def _numbers(values: FloatArray) -> list[list[float | None]]:
+    return [[value if np.isfinite(value) else None for value in row] for row in values.tolist()]
 
 
 def _text(value: float, number: str) -> str:

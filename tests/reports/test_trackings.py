@@ -63,13 +63,14 @@ def test_conditions_of_one_run_are_trackings(write_run):
     run = write_run("one", {"ga": 30.0, "ga+tracked": 27.0})
     found = tracking_runs(settings((str(run),))).data[0]
     assert (found["trackings"], found["methods"]) == (("one", "one+tracked"), ("ga",))
-    assert found["values"].tolist() == [[30.0, 27.0]]
+    assert found["values"] == [[30.0, 27.0]]
 
 
 def test_methods_without_a_value_are_not_in_the_effects(by_hand):
     runs = by_hand("a", {"ga": 30.0, "gbs": np.nan}), by_hand("b", {"ga": 29.0, "gbs": 28.0})
     found = tracking_runs(settings(runs))
     assert found.data[0]["chosen"] == (0,)
+    assert found.data[0]["values"] == [[30.0, 29.0], [None, 28.0]]
     (line,) = {line for line in found.text.splitlines() if line.startswith("gbs")}
     assert line.split() == ["gbs", "-", "28.0000", "-"]
     runs = by_hand("c", {"ga": np.nan}), by_hand("d", {"ga": np.nan})
@@ -129,7 +130,7 @@ def test_frames_are_matched_by_their_pictures(make_run, monkeypatch):
     changed.add(RunData.read(folders[0]).keys("novel_view")[0])
     fewer = tracking_runs(given)
     assert f"Novel view: {count - 1} of {count} frames in all runs." in fewer.text
-    assert not np.array_equal(plain.data[0]["values"], fewer.data[0]["values"])
+    assert plain.data[0]["values"] != fewer.data[0]["values"]
     monkeypatch.setattr(trackings, "LEAST", 1.0)
     with pytest.raises(InputError, match=f"pictures of novel_view.*{count - 1} of {count}"):
         tracking_runs(given)
