@@ -278,6 +278,10 @@ CASES = {
             "ours",
         ),
     ],
+    "report trackings": [
+        *(case(PLAIN.replace("plain", name), f"{name}/rows.parquet") for name in ("first", "second")),
+        case("report trackings first second --metrics psnr", "(?s)first +second.*No trained method"),
+    ],
     "run sweep": [
         case(
             "run sweep {demo} --out swept --methods ga --variants half --frames 1",
