@@ -24,7 +24,7 @@ from .aggregate import summarise
 from .runs import SPLIT_TASK, RunData, unseen_cameras
 from .writers import csv_text
 
-LEAST = 0.9
+LEAST = 0.8
 """Minimum fraction of the scored frames of each run that all runs have."""
 REMEDY = "Make the captures from the images of one, as `headbench track CAPTURE` does."
 
@@ -36,8 +36,8 @@ class TrackingsSettings:
     runs: tyro.conf.Positional[tuple[str, ...]]
     """Folders of finished runs, one for each tracking, with the same methods and settings. Conditions in a run, such as
     `tracked`, count as further trackings."""
-    metrics: tuple[str, ...] = ("psnr", "lpips")
-    """Metrics of frames."""
+    metrics: tuple[str, ...] = ()
+    """Metrics of frames; default: PSNR and LPIPS, as far as the runs have them."""
     regions: tuple[str, ...] = (FULL, "face")
     """Regions of the frames."""
     format: Literal["text", "csv"] = "text"
@@ -148,6 +148,7 @@ def comparisons(
     """One for each task, region and metric with any value, of runs with the same frames and methods."""
     first, found = runs[0], []
     specs = {spec.name: spec for spec in first.manifest.metrics if spec.per_frame}
+    metrics = metrics or [name for name in ("psnr", "lpips") if name in specs]
     for option, given, valid in (
         ("metrics", metrics, [*specs]),
         ("regions", regions, sorted(first.rows.regions)),

@@ -339,8 +339,10 @@ class _Fits:
     def finish(
         self, pixels: Mapping[int, FloatArray], landmarks: ImageLandmarks, seconds: float, progress: Progress
     ) -> None:
-        """Fit consecutive timesteps together, with the colours of all parts and small differences between neighbours."""
+        """Fit consecutive timesteps together, with the colours of all parts and small differences between neighbours. Timesteps
+        that become outliers keep their former poses."""
         known = sorted({*self.poses} - self.outliers())
+        former = {timestep: (self.poses[timestep], self.residuals[timestep]) for timestep in known}
         total = np.maximum(np.sum([one[:, 3:] for one in self.textures], axis=0), 1e-9)
         colours = np.sum([one[:, :3] * one[:, 3:] for one in self.textures], axis=0) / total
         texture = np.concatenate([colours, total], axis=1)
@@ -350,6 +352,8 @@ class _Fits:
             marks = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in part]))
             part_progress = partial(_part_progress, progress, number, len(parts))
             self.fit(f"last-{number:05d}", part, marks, part, part_progress, LastPass(texture, seconds))
+        for timestep in self.outliers() & former.keys():
+            self.poses[timestep], self.residuals[timestep] = former[timestep]
 
     def outliers(self) -> set[int]:
         """Timesteps whose fit is one of `outliers`."""
