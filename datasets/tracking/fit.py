@@ -209,9 +209,9 @@ WIDE_MM = 6.0
 COLOUR_WEIGHT = 0.1
 """Weight of a colour beside the prior."""
 EMPHASIS = (("eye_region", 4.0), ("lips", 10.0))
-"""Weights of landmarks of regions relative to others."""
+"""Weights of landmarks of regions relative to others, with one camera."""
 PAIR_MM, PAIR_WEIGHT = 1.0, 0.05
-"""Expected error of the difference between the landmarks of a pair, and its weight, as of a landmark."""
+"""Expected error of the difference between the landmarks of a pair, and its weight, as of a landmark; with one camera."""
 SHAPE_SPREAD = 0.3
 """Standard deviation of the prior of the identity coefficients; less than 1 for the same reason."""
 
@@ -341,7 +341,9 @@ class Fitter:
         0 where none is used."""
         distance, views = np.zeros(len(state.poses)), self.views
         weight /= len(views.cameras)
-        emphasis = self._emphasis()
+        # Where cameras see the face together, their errors at lips and lids contradict one another.
+        alone = len(views.cameras) == 1
+        emphasis = self._emphasis() if alone else np.ones(len(self.landmarks.corners))
         for row, pixels in enumerate(self.landmarks.pixels):
             posed = rig.linearised(state.shape, state.poses[row])
             projected = views.project(posed.points)
@@ -360,7 +362,8 @@ class Fitter:
             curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
             slope = np.einsum("cpki,cpk->pi", weighted, gap)
             equations.add(row, posed, curvature, slope)
-            self._add_pairs(equations, row, posed, projected, gap * seen[..., None], sigma, seen)
+            if alone:
+                self._add_pairs(equations, row, posed, projected, gap[0], sigma[0], seen[0])
         return distance
 
     def _emphasis(self) -> FloatArray:
@@ -381,22 +384,15 @@ class Fitter:
         sigma: FloatArray,
         seen: BoolArray,
     ) -> None:
-        """Add the differences between the landmarks of pairs."""
-        one, other = self.landmarks.pairs.T
+        """Add the differences between the landmarks of pairs in one camera, from the distances (L, 2) of all landmarks."""
+        one, other = self.landmarks.pairs[seen[self.landmarks.pairs].all(axis=1)].T
         jacobian = np.concatenate([posed.by_pose, posed.by_shape], axis=2)
-        for camera in range(len(seen)):
-            kept = np.flatnonzero(seen[camera, one] & seen[camera, other])
-            if not len(kept):
-                continue
-            a, b = one[kept], other[kept]
-            by_pixel = projected.derivative[camera]
-            rows = by_pixel[a] @ jacobian[a] - by_pixel[b] @ jacobian[b]  # (n, 2, D + S)
-            residual = gap[camera, a] - gap[camera, b]
-            scale = sigma[camera, a] * PAIR_MM / LANDMARK_MM
-            square = (residual**2).sum(axis=1)
-            weight = PAIR_WEIGHT / len(seen) / (scale * (1 + square / (ROBUST * scale) ** 2)) ** 2
-            width = rows.shape[2]
-            equations.add_residuals(row, rows.reshape(-1, width), np.repeat(weight, 2), residual.ravel())
+        by_pixel = projected.derivative[0]
+        rows = by_pixel[one] @ jacobian[one] - by_pixel[other] @ jacobian[other]  # (n, 2, D + S)
+        residual, scale = gap[one] - gap[other], sigma[one] * PAIR_MM / LANDMARK_MM
+        square = (residual**2).sum(axis=1)
+        weight = PAIR_WEIGHT / (scale * (1 + square / (ROBUST * scale) ** 2)) ** 2
+        equations.add_residuals(row, rows.reshape(-1, rows.shape[2]), np.repeat(weight, 2), residual.ravel())
 
     def fit_landmarks(
         self, state: HeadState, *, keep_shape: bool = False, weight: float = LEVELS[0].landmarks
