@@ -51,6 +51,7 @@ if _TYPE_CHECKING:
         TrainingMetric,
         TrueFrame,
         Variant,
+        VisibleFaceMetric,
     )
     from .bench.engine.adaptation import AdaptedClip, MethodNeeds
     from .bench.engine.config import resolve_method
@@ -137,6 +138,7 @@ __all__ = [
     "TrueFrame",
     "UnavailableError",
     "Variant",
+    "VisibleFaceMetric",
     "check_clip",
     "check_method",
     "check_metric",

@@ -454,6 +454,16 @@ class RegionalMetric(Metric, Protocol):
         """Value over each (H, W) mask; masks without pixels are left out."""
 
 
+class VisibleFaceMetric(Protocol):
+    """One number per frame over the visible face (`MetricSpec.kind` "face"). It may offer ``on`` as a `Metric` does."""
+
+    def __call__(self, image: ByteArray, target: ByteArray, face: BoolArray) -> float:
+        """Compare two (H, W, 3) 8-bit images; ``face`` is the (H, W) mask of the face's visible pixels.
+
+        Raises `LeftOutError` if the mask shows too little of the face.
+        """
+
+
 @runtime_checkable
 class TemporalMetric(Protocol):
     """One number per frame and its neighbour in time, of one camera and sequence (`MetricSpec.kind` "temporal")."""

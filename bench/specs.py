@@ -176,7 +176,7 @@ MAX_DIGITS = 12
 """Decimals shown in tables."""
 
 
-MetricKind = Literal["frame", "regional", "temporal", "sequence", "avatar", "mechanism", "training"]
+MetricKind = Literal["frame", "regional", "face", "temporal", "sequence", "avatar", "mechanism", "training"]
 
 
 @dataclass(frozen=True)
@@ -192,9 +192,9 @@ class MetricSpec:
     """"package.module:function" for the given ``kind``; a class is instantiated without arguments."""
     summary: str = ""
     kind: MetricKind = "frame"
-    """"frame", a `Metric`; "regional", a `RegionalMetric`; "temporal", a `TemporalMetric`; "sequence", a
-    `SequenceMetric`, whose value is assigned to each of the frames; "avatar", an `AvatarMetric`; "mechanism", one
-    whose workload is the poses of training; "training", a `TrainingMetric`."""
+    """"frame", a `Metric`; "regional", a `RegionalMetric`; "face", a `VisibleFaceMetric`; "temporal", a `TemporalMetric`;
+    "sequence", a `SequenceMetric`, whose value is assigned to each of the frames; "avatar", an `AvatarMetric`;
+    "mechanism", one whose workload is the poses of training; "training", a `TrainingMetric`."""
     detail: str = ""
     """Key of the measurement's details that holds the value, in ``unit``; "" for the main value. Metrics of an avatar
     with the same implementation are measured once, together."""
@@ -217,7 +217,7 @@ class MetricSpec:
     @property
     def per_frame(self) -> bool:
         """Whether every frame has a value; otherwise the avatar has one."""
-        return self.kind in ("frame", "regional", "temporal", "sequence")
+        return self.kind in ("frame", "regional", "face", "temporal", "sequence")
 
     @property
     def is_speed(self) -> bool:

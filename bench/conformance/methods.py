@@ -186,6 +186,9 @@ def check_metric(spec: MetricSpec) -> list[str]:
     if spec.kind == "regional":
         with attempt(breaches, "comparing regions"):
             breaches += _region_breaches(metric, spec)
+    if spec.kind == "face":
+        with attempt(breaches, "comparing a face"):
+            breaches += _face_breaches(metric)
     return breaches
 
 
@@ -302,6 +305,19 @@ def _region_breaches(metric: Any, spec: MetricSpec) -> Iterator[str]:
     small = {"left": left[:, :-8]}
     call: Callable[[], Any] = lambda: metric.in_regions(image, truth, small)
     yield from refusal(call, "a mask of another size", expected=Exception)
+
+
+def _face_breaches(metric: Any) -> Iterator[str]:
+    truth = picture()
+    face = np.zeros(SIZE, np.bool_)
+    face[16:64, 8:64] = True
+    inside, outside = (np.where(part[..., None], _noisy(truth, 32.0), truth) for part in (face, ~face))
+    equal, wrong, beside = (metric(image, truth, face) for image in (truth, inside, outside))
+    if abs(wrong - equal) <= abs(beside - equal):
+        yield "a fault in the face does not change the value more than one beside it"
+    yield from refusal(
+        lambda: metric(truth, truth, face[:, :-8]), "a mask of another size", expected=Exception
+    )
 
 
 class _GreyAvatar:

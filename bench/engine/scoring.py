@@ -24,6 +24,8 @@ from ..specs import MetricSpec
 HEAD = tuple(name for name in vars(HeadAsset) if not name.startswith("_"))
 SHARED = ("shape", "static_offset", "background", "cameras", "poses")
 """Attributes of a clip that all methods share."""
+FACE = "face"
+"""The region that is evaluated by default, and by metrics of kind "face"."""
 SLACK = 1e-3
 """How far colours and coverage may exceed [0, 1]: rounding in float32, below a quarter of an 8-bit step."""
 
@@ -143,7 +145,7 @@ def check_regions(clip: Clip, wanted: Sequence[str] | None) -> tuple[str, ...]:
     """Names of the regions to evaluate besides the whole frame; None requests the face if the clip has it."""
     known = tuple(clip.region_names) if isinstance(clip, RegionalClip) else ()
     if wanted is None:
-        return ("face",) if "face" in known else ()
+        return (FACE,) if FACE in known else ()
     names = tuple(name for name in dict.fromkeys(wanted) if name != FULL)
     for name in names:
         if name not in known:
@@ -242,6 +244,27 @@ def _batched(
         yield from (_missing(spec, key, error.note) for key in keys)
 
 
+def _faces(
+    keys: Sequence[FrameKey], frames: ScoredFrames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
+) -> Iterator[Score]:
+    """Scores of a metric of the visible face, which the clip locates."""
+    clip = frames.clip
+    if not isinstance(clip, RegionalClip) or FACE not in clip.region_names:
+        yield from (_missing(spec, key, "The reader does not locate the face.") for key in keys)
+        return
+
+    def read(key: FrameKey) -> tuple[Any, ...]:
+        return frames.render(key), frames.clip.image(key), clip.region_masks(key, [FACE])[FACE]
+
+    for key, images in zip(keys, _ahead(pool, read, keys), strict=True):
+        try:
+            yield Score(spec.name, key, FULL, float(metric(*images)))
+        except LeftOutError as error:
+            yield _missing(spec, key, f"{LEFT_OUT}{error}")
+        except UnavailableError as error:
+            yield _missing(spec, key, error.note)
+
+
 def _temporal(
     keys: Sequence[FrameKey], frames: ScoredFrames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
 ) -> Iterator[Score]:
@@ -291,12 +314,15 @@ def _sequences(
         yield _missing(spec, key, value) if isinstance(value, str) else Score(spec.name, key, FULL, value)
 
 
-STREAMS = {"temporal": _temporal, "sequence": _sequences}
-"""Scoring functions of metrics that compare several frames, by kind."""
+STREAMS = {"face": _faces, "temporal": _temporal, "sequence": _sequences}
+"""Scoring functions of metrics that need more than an image and its ground truth, by kind."""
 
 
 def compared_over_time(metric: Any, kind: str) -> Callable[[ByteArray, ByteArray], float]:
-    """Wrap a frame metric of any kind for single images, with an error-free neighbour or a static sequence."""
+    """Wrap a frame metric of any kind for single images, with an error-free neighbour, a static sequence or a face that fills
+    the frame."""
+    if kind == "face":
+        return lambda image, truth: metric(image, truth, np.ones(truth.shape[:2], np.bool_))
     if kind == "temporal":
         return lambda image, truth: metric(image, truth, np.roll(truth, 1, axis=1), np.roll(truth, 1, axis=1))
     if kind == "sequence":

@@ -591,6 +591,7 @@ def metric_entry(name: str, spec: Any) -> str:
 
 KINDS = {
     "regional": "measured for each frame and region",
+    "face": "measured for each frame in which the face is visible",
     "temporal": "measured for each frame and its predecessor",
     "sequence": "measured for all frames of a sequence at a camera together",
     "mechanism": "measured for each avatar over the poses of its training",

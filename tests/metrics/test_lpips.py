@@ -10,9 +10,10 @@ import pytest
 import torch
 from torch.nn import functional
 
-from headbench.bench.errors import InputError, UnavailableError
+from headbench.bench.conformance.methods import picture
+from headbench.bench.errors import InputError, LeftOutError, UnavailableError
 from headbench.metrics import lpips_network as weights
-from headbench.metrics.lpips import lpips
+from headbench.metrics.lpips import lpips, lpips_face
 from headbench.metrics.lpips_network import ALEX, NETWORKS, NO_WEIGHTS, SQUEEZE, VARIABLE, Lpips, read_weights
 
 
@@ -323,3 +324,63 @@ def test_the_cache_stays_within_its_bound_and_tells_sizes_apart(random_weights):
     expected = Lpips("squeeze", weights=random_weights, cache_mb=0)(other // 2, other)
     metric(one // 2, one)
     assert metric(other // 2, other) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.fixture
+def alex(random_weights, monkeypatch, bare_machine):
+    """The network of the metric of the face."""
+    monkeypatch.setenv(VARIABLE, str(random_weights))
+    return Lpips("alex", weights=random_weights)
+
+
+def mask(size, rows, columns):
+    inside = np.zeros(size, np.bool_)
+    inside[slice(*rows), slice(*columns)] = True
+    return inside
+
+
+def enlarged(image):
+    return cv2.resize(image, (256, 256), interpolation=cv2.INTER_LINEAR)
+
+
+def test_lpips_of_the_face_is_that_of_the_cut_images(alex):
+    a, b = frames(2, (80, 60))
+    high = mask((80, 60), (10, 42), (20, 40))  # 32 rows, centre at column 30
+    assert lpips_face(a, b, high) == alex(enlarged(a[10:42, 14:46]), enlarged(b[10:42, 14:46]))
+    beside = mask((80, 60), (10, 50), (0, 12))  # columns -14 to 26
+    wide = (np.pad(image, ((0, 0), (14, 0), (0, 0)), "edge") for image in (a, b))
+    assert lpips_face(a, b, beside) == alex(*(enlarged(image[10:50, :40]) for image in wide))
+    whole = frames(2, (512, 512))
+    means = (image.reshape(256, 2, 256, 2, 3).mean(axis=(1, 3)) for image in whole)
+    halved = [np.floor(each + 0.5).astype(np.uint8) for each in means]
+    assert lpips_face(*whole, np.ones((512, 512), np.bool_)) == pytest.approx(alex(*halved), rel=1e-3)
+
+
+def test_what_is_beside_the_crop_of_the_face_does_not_matter(alex):
+    a, b = frames(2, (80, 60))
+    face = mask((80, 60), (10, 42), (20, 40))
+    crop = mask((80, 60), (10, 42), (14, 46))[..., None]
+    value = lpips_face(a, b, face)
+    for level in (0, 255):
+        assert lpips_face(np.where(crop, a, level).astype(np.uint8), b, face) == value
+    assert lpips_face(np.where(crop, 128, a).astype(np.uint8), b, face) != value
+
+
+def test_the_size_of_the_frame_hardly_changes_the_face(alex):
+    large = [cv2.GaussianBlur(picture(seed, (384, 384)), (0, 0), 8) for seed in (1, 2)]
+    small = [cv2.resize(image, (128, 128), interpolation=cv2.INTER_AREA) for image in large]
+    face = mask((384, 384), (60, 330), (60, 330))
+    expected = lpips_face(*large, face)
+    assert lpips_face(*small, face[1::3, 1::3]) == pytest.approx(expected, rel=0.03)
+    assert alex(*small) != pytest.approx(alex(*large), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns"),
+    [((0, 0), (0, 0)), ((5, 20), (5, 20)), ((10, 50), (30, 39))],
+    ids=["none", "15", "9/40"],
+)
+def test_a_face_that_is_hardly_seen_is_left_out(alex, rows, columns):
+    a, b = frames(2, (80, 60))
+    with pytest.raises(LeftOutError, match="off screen or turned away"):
+        lpips_face(a, b, mask((80, 60), rows, columns))

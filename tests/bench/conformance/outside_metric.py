@@ -47,8 +47,13 @@ def hours(record):
     return Measurement(record["seconds"] / 3600, {})
 
 
+def face_error(image, truth, face):
+    return MeanError().in_regions(image, truth, {"face": face})["face"]
+
+
 ERROR = MetricSpec("mae", "MAE", "levels", False, 2, "outside_metric:MeanError", kind="regional")
 JUMP = MetricSpec("jump", "Jump", "levels", False, 2, "outside_metric:jump", kind="temporal")
+FACE = MetricSpec("face", "Face", "levels", False, 2, "outside_metric:face_error", kind="face")
 FILES = MetricSpec(
     "files", "Files", "", False, 0, "outside_metric:file_count", kind="avatar", detail="frames"
 )

@@ -113,6 +113,8 @@ def test_a_fault_in_regions_is_found(metrics, monkeypatch, fault):
     ("spec", "function", "faulty", "breach"),
     [
         ("JUMP", "jump", lambda a, b, c, d: -mean(a, b), "higher_is_better"),
+        ("FACE", "face_error", lambda a, b, face: mean(a, b), "in the face does not change the value more"),
+        ("FACE", "face_error", lambda a, b, face: mean(a, b), "a mask of another size was accepted"),
         ("FILES", "file_count", lambda avatar, workload: 1.0, "a float, not a Measurement"),
         ("FILES", "file_count", lambda avatar, workload: Measurement(np.inf, {}), "not a finite number"),
         ("HOURS", "hours", lambda record: Measurement(1.0, {}), "a record without any entry was accepted"),

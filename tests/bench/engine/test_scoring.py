@@ -127,6 +127,12 @@ def change(image, truth, other_image, other_truth):
     return float(image.astype(float).mean() - other_image.astype(float).mean())
 
 
+def face_level(image, truth, face):
+    if not face.any():
+        raise LeftOutError("no face is seen")
+    return float((image.astype(float) - truth)[face].mean())
+
+
 def unavailable(image, truth):
     raise UnavailableError("no weights.", "Get some.")
 
@@ -209,6 +215,18 @@ def test_a_temporal_metric_sees_the_neighbouring_frame(spec):
     assert "neighbouring" in scored[3].reason
 
 
+def test_a_metric_of_the_face_is_given_its_pixels(spec):
+    faces = spec("f", "face_level", kind="face")
+    scored = score_frames(KEYS, FRAMES, [faces])["f"]
+    assert [(s.key, s.region) for s in scored] == [(key, "full") for key in KEYS]
+    assert [s.value for s in scored if s.status == "ok"] == [5.0, 5.0, 5.0]
+    assert (scored[2].status, scored[2].reason) == ("missing", "left out: no face is seen")
+    plain = ScoredFrames(render, SimpleNamespace(image=RegionalToyClip().image))
+    assert {s.reason for s in score_frames(KEYS, plain, [faces])["f"]} == {
+        "The reader does not locate the face."
+    }
+
+
 def test_all_frames_of_a_sequence_have_the_value_of_their_video(spec):
     scored = score_frames(KEYS, FRAMES, [spec("v", "video", kind="sequence")])["v"]
     assert [s.value for s in scored] == [3.0, 3.0, 3.0, 1.0]
@@ -221,6 +239,7 @@ def test_all_frames_of_a_sequence_have_the_value_of_their_video(spec):
         ("unavailable", {}, "no weights. Get some."),
         ("faceless", {}, "left out: no face is found"),
         ("noted", {}, "Weights missing."),
+        ("noted", {"kind": "face"}, "Weights missing."),
         ("noted", {"kind": "temporal"}, "Weights missing."),
         ("noted", {"kind": "sequence"}, "Weights missing."),
         ("NotedBatches", {}, "Weights missing."),
