@@ -14,6 +14,7 @@ from ..contracts import Progress, no_progress
 from ..engine.config import (
     RunConfig,
     coded_conditions,
+    default_names,
     parse_size,
     resolve_cells,
     resolve_methods,
@@ -113,11 +114,27 @@ class SuiteSettings(ExecutionOptions):
     performance: Literal["parts", "natural"] = "natural"
     """As for `headbench synth`; with `natural` each subject has another choreography."""
 
+    dynamics: float = 1.0
+    """As for `headbench synth`."""
+
     tracking_error: float = 0.0
     """As for `headbench synth`."""
 
     tracker: Literal["per-frame", "video"] = "video"
     """As for `headbench synth`."""
+
+    hair_lag: float = 0.0
+    """As for `headbench synth`."""
+
+    camera_colour: float = 0.0
+    """As for `headbench synth`."""
+
+    correctives: float = 0.0
+    """As for `headbench synth`."""
+
+    held_out_cameras: tuple[str, ...] = ()
+    """Cameras of the novel views, instead of the frontal one alone, for example `222200037 221501007 222200041`: the frontal one,
+    one at a side and a low one."""
 
     def __post_init__(self) -> None:
         """Refuse invalid sizes and names."""
@@ -154,6 +171,13 @@ class SuiteSettings(ExecutionOptions):
 OURS = "ours"
 REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
 """Regions of the frame with separate tables."""
+FACE_CROP = "lpips-face"
+"""The metric that is measured besides those of every run."""
+OF_CAPTURES = (
+    *("subjects", "cameras", "timesteps", "performance", "dynamics", "tracking_error", "tracker"),
+    *("hair_lag", "camera_colour", "correctives"),
+)
+"""Settings of the suite that are those of `headbench synth`."""
 
 
 @command("run suite", group="compare", writes="out")
@@ -177,6 +201,8 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         preset=settings.preset,
         seeds=settings.seeds,
         regions=REGIONS,
+        metrics=(*default_names("metrics"), FACE_CROP),
+        reader_settings=_splits(settings),
     )
     coded = (PLAIN, *coded_conditions(methods))
     config = replace(plain, conditions=(*coded, *_conditions(settings, plain)))
@@ -200,15 +226,10 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         for planned, size in parts:
             (capture,) = synthesize(
                 planned.data,
-                subjects=settings.subjects,
                 only=place,
-                cameras=settings.cameras,
-                timesteps=settings.timesteps,
                 size=size,
                 seed=SEED,
-                performance=settings.performance,
-                tracking_error=settings.tracking_error,
-                tracker=settings.tracker,
+                **{name: getattr(settings, name) for name in OF_CAPTURES},
                 execution=execution,
                 progress=progress,
             )
@@ -226,6 +247,27 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
     return CommandResult(
         "\n\n".join([f"Tables of all results: {out / 'results.md'}", *ends]), data, not failed
     )
+
+
+def _splits(settings: SuiteSettings) -> dict[str, list[str]]:
+    """Settings of the reader that hold out the requested cameras and the usual sequences; none for the capture's own splits."""
+    from ...datasets.synthetic.performance import HELD_OUT, share_out
+    from ...datasets.synthetic.plan import serials
+
+    held_out = settings.held_out_cameras
+    if not held_out:
+        return {}
+    known = serials(settings.cameras)
+    if unknown := [name for name in held_out if name not in known]:
+        expected = f"some of {', '.join(known)}, which --cameras {settings.cameras} makes"
+        raise InputError("command line", "--held-out-cameras", expected, ", ".join(unknown))
+    if len(set(held_out)) == len(known):
+        raise InputError("command line", "--held-out-cameras", "fewer than all cameras", ", ".join(held_out))
+    sequences = share_out(settings.timesteps, settings.performance)
+    return {
+        "held_out_cameras": list(held_out),
+        "held_out_sequences": [name for name in sequences if name.startswith(HELD_OUT)],
+    }
 
 
 def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:

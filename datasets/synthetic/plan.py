@@ -256,21 +256,28 @@ _FRAME_WIDTH = 0.270
 _SPREAD = (8, 0, 15, 3, 12, 6, 5, 10, 1, 14, 7, 9, 2, 13, 4, 11)
 
 
+def serials(count: int) -> list[str]:
+    """Names of ``count`` cameras, in canonical order."""
+    if not 1 <= count <= len(SERIALS):
+        raise InputError("--cameras", "", f"1 to {len(SERIALS)} cameras", str(count))
+    return [SERIALS[i] for i in sorted(_SPREAD[:count])]
+
+
 def cameras(count: int, width: int, height: int, target: FloatArray, seed: int = 0) -> dict[str, Camera]:
     """``count`` cameras by serial, in canonical order, looking at ``target`` (3,).
 
     Every set holds the frontal camera. The principal point lies a little off the image's centre (below 1 %
     of the width, another one per capture), and all cameras share it, as one calibration does.
     """
-    if not 1 <= count <= len(SERIALS):
-        raise InputError("--cameras", "", f"1 to {len(SERIALS)} cameras", str(count))
+    names = serials(count)
     focal = CAMERA_DISTANCE * min(width / _FRAME_WIDTH, height / _FRAME_HEIGHT)
     shift = np.random.default_rng([seed, 11]).uniform(-0.008, 0.008, 2) * width
     K = np.array(
         [[focal, 0.0, 0.5 * width + shift[0]], [0.0, focal, 0.5 * height + shift[1]], [0.0, 0.0, 1.0]]
     )
-    chosen = sorted(_SPREAD[:count])
-    return {SERIALS[i]: Camera(SERIALS[i], width, height, K, _look_at(*_place(i), target)) for i in chosen}
+    return {
+        name: Camera(name, width, height, K, _look_at(*_place(SERIALS.index(name)), target)) for name in names
+    }
 
 
 def _place(index: int) -> tuple[float, float]:

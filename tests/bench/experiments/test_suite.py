@@ -12,8 +12,11 @@ from headbench.bench.configuration import merge
 from headbench.bench.engine.config import resolve_cells, resolve_method
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.experiments import suite as module
+from headbench.bench.rows import ALL
+from headbench.datasets.open import open_clip
+from headbench.datasets.synthetic.command import SynthSettings
 from headbench.datasets.synthetic.panels import default_samples
-from headbench.datasets.synthetic.plan import SyntheticSettings
+from headbench.datasets.synthetic.plan import FRONTAL, SyntheticSettings
 from headbench.methods.ours.spec import ADDITIONS, OURS, OURS_PLUS
 from headbench.reports.suite.suite import suite_runs
 
@@ -141,6 +144,45 @@ def test_every_subject_has_a_run_and_the_first_also_large_images(asked):
     assert [condition.name for condition in later[1][1].conditions] == [""]
 
 
+RECORDED = ("--tracker", "video", "--tracking-error", "1", "--correctives", "1", "--hair-lag", "1")
+RECORDED += ("--camera-colour", "1", "--dynamics", "2")
+
+
+def test_captures_have_the_effects_of_recordings_at_every_size(asked):
+    effects = {"tracker": "video", "tracking_error": 1.0, "correctives": 1.0, "hair_lag": 1.0}
+    effects |= {"camera_colour": 1.0, "dynamics": 2.0}
+    for (capture, _), size in zip(asked(*RECORDED, *ONE[:2], "--size", "40x58"), [(40, 58), (80, 116)]):
+        assert {**effects, "size": size}.items() <= capture.items()
+    ((plain, config),) = asked(*ONE)
+    defaults = SynthSettings("")
+    assert {name: plain[name] for name in effects} == {name: getattr(defaults, name) for name in effects}
+    assert config.reader_settings == {}
+    assert "lpips-face" in config.metrics
+
+
+@pytest.mark.slow
+def test_held_out_cameras_are_the_novel_views(tmp_path):
+    """On the recorded capture, whose own split has the frontal camera; sequences and all else are as in it."""
+    words = ["run", "suite", "--out", str(tmp_path / "s"), "--methods", "mean-image", "--preset", "smoke"]
+    words += [*ONE, "--cameras", "3", "--timesteps", "60", "--size", "24x34", *RECORDED]
+    held_out = [FRONTAL, "221501007"]
+    assert cli.main([*words, "--held-out-cameras", *held_out]) == 0
+    folder = RunFolder(tmp_path / "s" / "run" / "01")
+    manifest = folder.read_manifest()
+    own = open_clip(tmp_path / "s" / "capture")
+    scored = {task: {*protocol.keys} for task, protocol in manifest.protocols.items()}
+    every = {key for keys in own.splits.values() for key in keys}
+    assert scored["self_reenactment"] == {*own.splits["self_reenactment"]}
+    others = every - scored["self_reenactment"]
+    assert scored["novel_view"] == {key for key in others if key.camera in held_out}
+    assert {key.camera for key in own.splits["novel_view"]} == {FRONTAL}
+    values = folder.read_rows(manifest).select(
+        method="mean-image", metric="lpips-face", task="novel_view", region="full", seeds=ALL
+    )
+    assert len(values) == len(scored["novel_view"])
+    assert (values["status"] == "ok").all()
+
+
 def test_ablations_change_ours_and_additions_make_ours_plus():
     additions = reduce(merge, ADDITIONS.values(), {})
     for preset in OURS.presets:
@@ -161,6 +203,9 @@ def test_ablations_change_ours_and_additions_make_ours_plus():
         (["--subjects", "2", "--first", "3"], "at most --subjects, 2"),
         (["--levels", "5"], "above 0 and at most 4"),
         (["--set", "preset=smoke"], "expected one of execution"),
+        (["--hair-lag", "5"], "--hair-lag: expected 0 to 4"),
+        (["--cameras", "4", "--held-out-cameras", FRONTAL, "222200044"], "which --cameras 4 makes"),
+        (["--cameras", "2", "--held-out-cameras", "222200042", FRONTAL], "fewer than all cameras"),
     ],
 )
 def test_what_cannot_be_run_is_refused_before_a_capture_is_made(tmp_path, capsys, words, match):
