@@ -279,7 +279,10 @@ CASES = {
         ),
     ],
     "report trackings": [
-        *(case(PLAIN.replace("plain", name), f"{name}/rows.parquet") for name in ("first", "second")),
+        *(
+            case(PLAIN.replace("plain", name), "mean-image", f"{name}/rows.parquet")
+            for name in ("first", "second")
+        ),
         case("report trackings first second --metrics psnr", "(?s)first +second.*No trained method"),
     ],
     "run sweep": [
