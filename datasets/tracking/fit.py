@@ -21,7 +21,7 @@ from ...bench.errors import InputError
 from ..head.arrays import HeadArrays
 from ..head.geometry import vertex_normals
 from .landmarks import ImageLandmarks, spread_vertices
-from .outline import MeshOutline, Outline, OutlinePoints, gaps, static_offset
+from .outline import Gaps, MeshOutline, Outline, OutlinePoints, gaps, static_offset
 from .rig import FrameStack, Occlusion, PointRig, PoseColumns, PosedPoints, Projection, Views
 from .settings import FOCAL_SPREAD, USUAL_FOCAL
 
@@ -50,7 +50,10 @@ def with_offset(head: HeadArrays, offset: FloatArray) -> HeadArrays:
 
 
 class NormalEquations:
-    """Sums of ``J' A J`` and ``J' b`` over points, for T timesteps with D parameters each and S shared ones. ``state``: Estimate with these sizes."""
+    """Sums of ``J' A J`` and ``J' b`` over points, for T timesteps with D parameters each and S shared ones.
+
+    ``state``: Estimate with these sizes.
+    """
 
     def __init__(self, state: HeadState):
         timesteps, self._split = state.poses.shape
@@ -252,6 +255,7 @@ class OutlinedView(NamedTuple):
     row: int
     """Of the timestep."""
     camera: int
+    outline: Outline
     points: OutlinePoints
     rig: PointRig
     normals: FloatArray
@@ -339,17 +343,17 @@ class Fitter:
     ) -> FloatArray:
         """Add the landmarks to the equations with a weight; return their root mean square distance at each timestep, (T,) pixels;
         0 where none is used."""
-        distance, views = np.zeros(len(state.poses)), self.views
-        weight /= len(views.cameras)
+        distance = np.zeros(len(state.poses))
+        weight /= len(self.views.cameras)
         # Where cameras see the face together, their errors at lips and lids contradict one another.
-        alone = len(views.cameras) == 1
+        alone = len(self.views.cameras) == 1
         emphasis = self._emphasis() if alone else np.ones(len(self.landmarks.corners))
         for row, pixels in enumerate(self.landmarks.pixels):
             posed = rig.linearised(state.shape, state.poses[row])
-            projected = views.project(posed.points)
+            projected = self.views.project(posed.points)
             seen = np.isfinite(pixels[..., 0])
             gap = np.where(seen[..., None], pixels - projected.pixels, 0.0)
-            per_metre = views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
+            per_metre = self.views.intrinsics[:, None, 0, 0] / np.maximum(projected.depth, 0.05)
             sigma = 1e-3 * LANDMARK_MM * per_metre
             square = (gap**2).sum(axis=2)
             # All landmarks of an image may be wrong if the network detects something else as a face.
@@ -465,37 +469,38 @@ class Fitter:
         return Fitted(state, landmarks, colours, found)
 
     def _outlined(self, state: HeadState, mesh: PointRig, scalp: bool) -> list[OutlinedView]:
-        """The outlines of the posed meshes."""
+        """The outlines of the posed meshes in images with masks."""
         if not any(self.outlines):
             return []
-        views = self.views
-        finder = MeshOutline(self.head, mesh.points(state.shape, state.poses[0]), views, scalp)
+        finder = MeshOutline(self.head, mesh.points(state.shape, state.poses[0]), self.views, scalp)
         faces, result = np.asarray(self.head.faces), []
         for row, pose in enumerate(state.poses):
             posed = mesh.points(state.shape, pose).astype(np.float64)
             normals = vertex_normals(posed, faces)
             for camera, points in enumerate(finder.points(posed)):
-                if not len(points.corners):
+                outline = self.outlines[row * len(self.views.cameras) + camera]
+                if outline is None or not len(points.corners):
                     continue
                 mixed = np.einsum("nk,nki->ni", points.weights, normals[points.corners])
-                outward = (mixed @ views.rotations[camera].T)[:, :2]
+                outward = (mixed @ self.views.rotations[camera].T)[:, :2]
                 outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-                result.append(OutlinedView(row, camera, points, mesh.mixed(*points), outward))
+                result.append(OutlinedView(row, camera, outline, points, mesh.mixed(*points), outward))
         return result
+
+    def _gaps(self, view: OutlinedView, points: FloatArray) -> tuple[Gaps, Projection, FloatArray]:
+        """Distances of the posed points of a view from the outline, their projection, and its pixels per metre (n,)."""
+        projected = self.views.project(points, np.full(len(points), view.camera))
+        per_metre = self.views.intrinsics[view.camera, 0, 0] / projected.depth
+        return gaps(view.outline, projected.pixels, view.normals), projected, per_metre
 
     def _add_outlines(
         self, equations: NormalEquations, state: HeadState, outlined: Sequence[OutlinedView]
     ) -> None:
         """Add the distances between both outlines to the equations."""
-        cameras = self.views
         for view in outlined:
-            outline = self.outlines[view.row * len(cameras.cameras) + view.camera]
-            if outline is None:
-                continue
             posed = view.rig.linearised(state.shape, state.poses[view.row])
-            projected = cameras.project(posed.points, np.full(len(posed.points), view.camera))
-            found = gaps(outline, projected.pixels, view.normals)
-            sigma = 1e-3 * OUTLINE_MM * cameras.intrinsics[view.camera, 0, 0] / projected.depth
+            found, projected, per_metre = self._gaps(view, posed.points)
+            sigma = 1e-3 * OUTLINE_MM * per_metre
             robust = found.aligned * OUTLINE_WEIGHT
             robust /= (sigma * (1 + (found.distance / (OUTLINE_ROBUST * sigma)) ** 2)) ** 2
             along = np.einsum("ni,nik->nk", found.normals, projected.derivative)
@@ -505,34 +510,26 @@ class Fitter:
     def fit_offset(self, state: HeadState) -> FloatArray:
         """(V, 3) static offset, metres, that moves the outline of the mesh to those of the masks."""
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
-        views, parts, distances = self.views, [], []
+        parts, distances = [], []
         for view in self._outlined(state, mesh, True):
-            outline = self.outlines[view.row * len(views.cameras) + view.camera]
-            if outline is None:
-                continue
-            projected = views.project(
-                view.rig.points(state.shape, state.poses[view.row]), np.full(len(view.normals), view.camera)
-            )
-            found = gaps(outline, projected.pixels, view.normals)
+            points = view.rig.points(state.shape, state.poses[view.row])
+            found, _, per_metre = self._gaps(view, points)
             kept = found.aligned > 0
-            metres = found.distance * projected.depth / views.intrinsics[view.camera, 0, 0]
             parts.append(OutlinePoints(view.points.corners[kept], view.points.weights[kept]))
-            distances.append(metres[kept])
+            distances.append((found.distance / per_metre)[kept])
         if not parts:
             return np.zeros(np.shape(self.head.template))
         neutral = np.asarray(self.head.template + self.head.shape_basis @ state.shape, np.float64)
-        points = OutlinePoints(*map(np.concatenate, zip(*parts)))
-        return static_offset(self.head, neutral, points, np.concatenate(distances))
+        every = OutlinePoints(*map(np.concatenate, zip(*parts)))
+        return static_offset(self.head, neutral, every, np.concatenate(distances))
 
     def _pixels_per_millimetre(self, mesh: PointRig, state: HeadState) -> float:
-        views = self.views
-        depth = views.place(mesh.points(state.shape, state.poses[0]))[1]
-        return float(np.median(1e-3 * views.intrinsics[:, 0, 0] / np.median(depth, axis=1)))
+        depth = self.views.place(mesh.points(state.shape, state.poses[0]))[1]
+        return float(np.median(1e-3 * self.views.intrinsics[:, 0, 0] / np.median(depth, axis=1)))
 
     def _observations(self, state: HeadState, mesh: PointRig, vertices: IntArray) -> Observations:
         """The vertices that each frame sees."""
-        views = self.views
-        occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), views)
+        occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), self.views)
         frames, points, weights = [], [], []
         for row, pose in enumerate(state.poses):
             cosine = occlusion.visible(mesh.points(state.shape, pose).astype(np.float64), vertices)
@@ -554,14 +551,13 @@ class Fitter:
     ) -> tuple[FloatArray, FloatArray]:
         """Add the colours to the equations; return their median difference at each timestep, (T,) 8-bit levels, and the
         `Fitted.texture`, which is ``known`` if that is given."""
-        views = self.views
-        cameras = len(views.cameras)
+        cameras = len(self.views.cameras)
         bounds = np.searchsorted(samples.frame, np.arange(len(state.poses) + 1) * cameras)
         posed = [rig.points(state.shape, pose) for pose in state.poses]
         sampled = []
         for row, (start, end) in enumerate(pairwise(bounds)):
             frame, point = samples.frame[start:end], samples.point[start:end]
-            projected = views.project(posed[row][point], frame - row * cameras)
+            projected = self.views.project(posed[row][point], frame - row * cameras)
             values, gradients = stack.sample(frame, projected.pixels)
             sampled.append((values, gradients @ projected.derivative.astype(np.float32)))
         values = np.concatenate([part[0] for part in sampled])

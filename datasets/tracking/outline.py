@@ -46,8 +46,6 @@ def outline_of(mask: ByteArray) -> Outline | None:
     pixels = max(contours, key=len)[:, ::-1] + 0.5
     size = np.array(mask.shape[::-1])
     pixels = pixels[((pixels > BORDER) & (pixels < size - BORDER)).all(axis=1)]
-    if not len(pixels):
-        return None
     blurred = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _SMOOTH)
     slopes = [
         cv2.Sobel(blurred, cv2.CV_32F, *axes)[*np.floor(pixels[:, ::-1]).astype(int).T]
@@ -56,11 +54,9 @@ def outline_of(mask: ByteArray) -> Outline | None:
     normals = -np.stack(slopes, axis=1).astype(np.float64)
     length = np.linalg.norm(normals, axis=1)
     pixels, normals = pixels[length > 0], (normals / np.maximum(length, 1e-9)[:, None])[length > 0]
-    return (
-        Outline(pixels, normals, cKDTree(np.concatenate([pixels, REACH * normals], axis=1)))
-        if len(pixels)
-        else None
-    )
+    if not len(pixels):
+        return None
+    return Outline(pixels, normals, cKDTree(np.concatenate([pixels, REACH * normals], axis=1)))
 
 
 class OutlinePoints(NamedTuple):
