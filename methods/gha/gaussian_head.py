@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
 from typing import NamedTuple
 
 import torch
@@ -13,11 +12,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...bench.contracts import Camera
-from ..ops.layers import ROWS_STEP
 from ..ops.splats import WorldSplats, left_products
 from ..shared.rendering import rasterize_view, view_of
-from .driving import HeadMotion, Signal, influences, padded
-from .mesh_head import ATTRIBUTES, Controllers, Influences, Pair, Weights, encode, encode_pose, taken, uniform
+from .driving import HeadMotion, Signal, influences
+from .mesh_head import ATTRIBUTES, Controllers, Influences, Weights, encode, encode_pose, uniform
 from .spec import GHAConfig
 
 POINTS = {"points": 3, "log_scales": 3, "quats": 4, "opacities": 1}
@@ -40,25 +38,24 @@ class FeatureSplats(NamedTuple):
     features: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class FeatureImage:
+class FeatureImage(NamedTuple):
     """A view at the splatted size: the (h, w, C) feature image and its (h, w) alpha."""
 
     features: Tensor
     alpha: Tensor
 
-    @cached_property
+    @property
     def colors(self) -> Tensor:
         """(h, w, 3): the first features."""
         return self.features[..., :3]
 
 
 class PointInputs(NamedTuple):
-    """Influences of the controllers, and for the points of each the (n, 27) encoded points and (n, F) features within (-1, 1)."""
+    """Influences of the controllers, and (N, 27) encoded points and (N, F) features within (-1, 1)."""
 
     parts: Influences
-    encoded: Pair
-    features: Pair
+    encoded: Tensor
+    features: Tensor
 
 
 @dataclass(frozen=True)
@@ -80,17 +77,11 @@ class GaussianHead:
         shapes = self.super_resolution.shapes()
         return {n: s for mlp in self.controllers.of_gaussians for n, s in mlp.shapes().items()} | shapes
 
-    def inputs(self, tensors: Weights, nearest: Tensor | None = None) -> PointInputs:
-        """Inputs of the networks that depend only on the points and their features, for all poses.
-
-        ``nearest``: see `influences`.
-        """
+    def inputs(self, tensors: Weights) -> PointInputs:
+        """Inputs of the networks that depend only on the points and their features, for all poses."""
         c, points = self.config, tensors["points"]
-        landmarks = tensors["landmarks"].detach()
-        near, far = influences(points, landmarks, c.near_squared, c.far_squared, nearest)
-        parts = padded(near, ROWS_STEP), padded(far, ROWS_STEP)
-        features = torch.tanh(tensors["features"])
-        return PointInputs(parts, taken(encode(points), parts), taken(features, parts))
+        parts = influences(points, tensors["landmarks"].detach(), c.near_squared, c.far_squared)
+        return PointInputs(parts, encode(points), torch.tanh(tensors["features"]))
 
     def splats(
         self,
@@ -109,18 +100,18 @@ class GaussianHead:
         points = tensors["points"]
         parts, encoded, features = inputs or self.inputs(tensors)
         pose, code = encode_pose(motion.code), signal.expression
-        moves = nets.displacements(tensors, encoded, parts, (code, pose), len(points))
+        moves = nets.displacements(tensors, encoded, parts, code, pose)
         seen = torch.minimum(torch.maximum(code, tensors["code_low"]), tensors["code_high"])
         if noise is not None:
             seen = seen + noise
-        changes = nets.attributes(tensors, features, parts, (seen, pose), len(points))
+        changes = nets.attributes(tensors, features, parts, seen, pose)
         turn = left_products(motion.quaternion[None])[0]
         placed = posed(
             *(c, motion.rotation, motion.translation, turn, points, moves),
             *(tensors["log_scales"], tensors["quats"], tensors["opacities"], changes),
         )
         means, quats, sizes, opacities = placed
-        colors = nets.colors(tensors, features, parts, (seen, pose), len(points))
+        colors = nets.colors(tensors, features, parts, seen, pose)
         return FeatureSplats(WorldSplats(means, quats, sizes), opacities, colors)
 
     def draw(self, splats: FeatureSplats, camera: Camera, background: Tensor) -> FeatureImage:
@@ -158,12 +149,9 @@ def feature_camera(camera: Camera, upscale: int) -> Camera:
 
 
 def near_drawn(alpha: Tensor) -> Tensor:
-    """(h, w) whether something is drawn within `REACH` pixels."""
-    near = F.pad(alpha.detach() > COVERED, (REACH,) * 4)
-    for axis in range(2):  # bits of slices; a maximum over squares takes ten times as long
-        size = alpha.shape[axis]
-        near = reduce(torch.logical_or, (near.narrow(axis, start, size) for start in range(2 * REACH + 1)))
-    return near
+    """(h, w) of 0 and 1: whether something is drawn within `REACH` pixels."""
+    drawn = (alpha.detach() > COVERED).to(alpha.dtype)
+    return F.max_pool2d(drawn[None, None], 2 * REACH + 1, stride=1, padding=REACH)[0, 0]
 
 
 def enlarged(values: Tensor, factor: int) -> Tensor:
@@ -267,9 +255,9 @@ class SuperResolution:
         """(u H, u W, 3) image of the last layer's (u H, u W, 3) output; the background where nothing is near."""
         near = enlarged(near_drawn(drawn.alpha), self.upscale)
         if not self.residual:
-            return torch.where(near[..., None], torch.sigmoid(colors), background)
+            return torch.where(near[..., None] > 0, torch.sigmoid(colors), background)
         plain, alpha = self._plain(drawn)
-        return torch.where(near[..., None], plain + alpha[..., None] * colors, background)
+        return torch.where(near[..., None] > 0, plain + alpha[..., None] * colors, background)
 
     def _plain(self, drawn: FeatureImage) -> tuple[Tensor, Tensor]:
         """(u H, u W, 3) splatted colours and their (u H, u W) alpha."""
@@ -329,7 +317,7 @@ def normalised_convolution(values: Tensor, weight: Tensor) -> Tensor:
     # Instance normalisation of a single image equals batch normalisation, whose torch kernel also accepts an image of
     # one pixel (which becomes 0).
     normalised = torch.native_batch_norm(raw, None, None, None, None, True, 0.0, VARIANCE_FLOOR)[0]
-    return F.relu(normalised).squeeze(0).permute(1, 2, 0)
+    return F.relu(normalised)[0].permute(1, 2, 0)
 
 
 Reader = Callable[[int, int], Tensor]

@@ -18,7 +18,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..ops.layers import layer
 from ..ops.planes import ENCODING_SIZE, encode
 from ..ops.splats import WorldSplats
 from .driving import POSE_SIZE, HeadMotion, Influence, Signal, influences
@@ -66,18 +65,18 @@ class Mlp:
         """Shape of every tensor, by name."""
         widths = self.widths
         shapes: dict[str, tuple[int, ...]] = {}
-        for number in range(len(widths) - 1):
-            extra = widths[0] if number and number == self._skip_layer else 0
-            shapes[f"{self.name}.weight_{number}"] = (widths[number + 1], widths[number] + extra)
-            shapes[f"{self.name}.bias_{number}"] = (widths[number + 1],)
+        for layer in range(len(widths) - 1):
+            extra = widths[0] if layer and layer == self._skip_layer else 0
+            shapes[f"{self.name}.weight_{layer}"] = (widths[layer + 1], widths[layer] + extra)
+            shapes[f"{self.name}.bias_{layer}"] = (widths[layer + 1],)
         return shapes
 
     def initial(self, generator: torch.Generator, device: str = "cpu") -> dict[str, Tensor]:
         """Weights and biases uniform within 1 / sqrt(inputs) of a layer."""
         tensors = uniform(self.shapes(), generator, device)
         if self.zero_condition_weights and self.condition_inputs:
-            for number in {0, self._skip_layer}:
-                tensors[f"{self.name}.weight_{number}"][:, -self.condition_inputs :] = 0
+            for layer in {0, self._skip_layer}:
+                tensors[f"{self.name}.weight_{layer}"][:, -self.condition_inputs :] = 0
         if self.zero_initialised:
             for part in ("weight", "bias"):
                 tensors[f"{self.name}.{part}_{len(self.hidden)}"].zero_()
@@ -91,23 +90,25 @@ class Mlp:
         ``outputs`` limits the result to the first outputs.
         """
 
-        last = len(self.hidden)
+        count, size = len(self.widths) - 1, self.point_inputs
         values = points
-        for number in range(last + 1):
-            weight, bias = weights[f"{self.name}.weight_{number}"], weights[f"{self.name}.bias_{number}"]
-            slope = SLOPE if number < last else 1.0
-            if number == last and outputs is not None:
+        for layer in range(count):
+            weight, bias = weights[f"{self.name}.weight_{layer}"], weights[f"{self.name}.bias_{layer}"]
+            if layer == count - 1 and outputs is not None:
                 weight, bias = weight[:outputs], bias[:outputs]
-            again = number > 0 and number == self._skip_layer
-            if again:
-                values = torch.cat([values, points.expand(*values.shape[:-1], -1)], dim=-1)
-            if condition is not None and (number == 0 or again):
-                weight, by_condition = weight.split([values.shape[-1], self.condition_inputs], dim=1)
-                bias = F.linear(condition, by_condition, bias)
-            if bias.ndim == 1:
-                values = layer(values, weight, bias, slope)
+            again = layer > 0 and layer == self._skip_layer
+            if layer == 0 or again:
+                start = self.widths[layer] if again else 0
+                if condition is not None:
+                    bias = F.linear(condition, weight[:, start + size :], bias).unsqueeze(-2)
+                if again:
+                    bias = F.linear(values, weight[:, :start]) + bias
+                by_points = weight[:, start : start + size].t()
+                values = torch.addmm(bias, points, by_points) if bias.ndim < 3 else points @ by_points + bias
             else:
-                values = F.leaky_relu(F.linear(values, weight) + bias[:, None], slope)
+                values = F.linear(values, weight, bias)
+            if layer < count - 1:
+                values = F.leaky_relu(values, SLOPE)
         return values
 
 
@@ -127,16 +128,13 @@ def uniform(
 ATTRIBUTES = (3, 4, 1)
 """Columns of log-scale, quaternion and opacity logit."""
 Influences = tuple[Influence, Influence]
-Pair = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
 class Controllers:
     """The six networks.
 
-    Of pairs, the first is for the networks of expression, the second for those of the pose: (n, F) inputs of the n points that each
-    acts on, and conditions, the (E,) expression code and the (54,) encoded head pose (`encode_pose`). Results are for all N
-    points, ``count``.
+    ``expression`` is the (E,) expression code throughout, ``pose`` the (54,) encoded head pose (`encode_pose`).
     """
 
     expression_color: Mlp
@@ -175,29 +173,29 @@ class Controllers:
     def colors(
         self,
         weights: Weights,
-        features: Pair,
+        features: Tensor,
         influences: Influences,
-        conditions: Pair,
-        count: int,
+        expression: Tensor,
+        pose: Tensor,
         channels: int | None = None,
     ) -> Tensor:
-        """(N, C) of features within (-1, 1), without activation; the first ``channels`` if given."""
+        """(N, C) of (N, F) features within (-1, 1), without activation; the first ``channels`` if given."""
         networks = (self.expression_color, self.pose_color)
-        return blended(networks, weights, features, influences, conditions, count, channels=channels)
+        return blended(networks, weights, features, influences, (expression, pose), channels=channels)
 
     def attributes(
-        self, weights: Weights, features: Pair, influences: Influences, conditions: Pair, count: int
+        self, weights: Weights, features: Tensor, influences: Influences, expression: Tensor, pose: Tensor
     ) -> Tensor:
         """(N, 8) offsets of `ATTRIBUTES`, before their common factor."""
         networks = (self.expression_attribute, self.pose_attribute)
-        return blended(networks, weights, features, influences, conditions, count)
+        return blended(networks, weights, features, influences, (expression, pose))
 
     def displacements(
-        self, weights: Weights, encoded: Pair, influences: Influences, conditions: Pair, count: int
+        self, weights: Weights, encoded: Tensor, influences: Influences, expression: Tensor, pose: Tensor
     ) -> Tensor:
-        """(N, 3) displacements of encoded points, each within (-1, 1), before their factor."""
+        """(N, 3) displacements of points, whose (N, 27) encoding is given, each within (-1, 1), before their factor."""
         networks = (self.expression_deform, self.pose_deform)
-        return blended(networks, weights, encoded, influences, conditions, count, tanh_output=True)
+        return blended(networks, weights, encoded, influences, (expression, pose), tanh_output=True)
 
 
 def encode_pose(code: Tensor) -> Tensor:
@@ -205,29 +203,22 @@ def encode_pose(code: Tensor) -> Tensor:
     return encode(code[None])[0]
 
 
-def taken(values: Tensor, influences: Influences) -> Pair:
-    """(n, F) rows of (N, F) values for the points of each influence."""
-    near, far = influences
-    return values.index_select(0, near.rows), values.index_select(0, far.rows)
-
-
 def blended(
     networks: tuple[Mlp, Mlp],
     weights: Weights,
-    inputs: Pair,
+    inputs: Tensor,
     influences: Influences,
-    conditions: Pair,
-    count: int,
+    conditions: tuple[Tensor, Tensor],
     *,
     tanh_output: bool = False,
     channels: int | None = None,
 ) -> Tensor:
-    """(N, C) sum of two networks' outputs, with tanh if ``tanh_output``, see `Controllers`."""
+    """(N, C) sum of two networks' outputs, with tanh if ``tanh_output``, at (N, F) inputs."""
     parts = [
-        network(weights, values, condition, channels)
-        for network, values, condition in zip(networks, inputs, conditions)
+        network(weights, inputs.index_select(0, part.rows), condition, channels)
+        for network, part, condition in zip(networks, influences, conditions)
     ]
-    total = parts[0].new_zeros(count, parts[0].shape[1])
+    total = parts[0].new_zeros(len(inputs), parts[0].shape[1])
     for part, values in zip(influences, parts):
         values = torch.tanh(values) if tanh_output else values
         total = total.index_add(0, part.rows, part.weights[:, None] * values)
@@ -323,8 +314,7 @@ class MeshHead:
         vertices = vertices.index_add(0, far.rows, c.displacement_scale * far.weights[:, None] * by_pose)
         displaced = by_expression.square().sum(1).mean() if len(start) else by_expression.sum()
         displaced = displaced + (by_pose.square().sum(1).mean() if len(moved) else by_pose.sum())
-        features, conditions = taken(surface.features, (near, far)), (signal.expression, pose)
-        colors = nets.colors(weights, features, (near, far), conditions, len(vertices), channels=3)
+        colors = nets.colors(weights, surface.features, (near, far), signal.expression, pose, channels=3)
         world = c.unit * vertices @ motion.rotation.t() + motion.translation
         return world, colors if c.residual else torch.sigmoid(colors), displaced
 

@@ -198,18 +198,16 @@ def sample_plane(plane: Tensor, coordinates: Tensor, resolution: int) -> Tensor:
 
 def encode(values: Tensor, frequencies: int = len(FREQUENCIES)) -> Tensor:
     """(N, D + 2 L D) positional encoding of (N, D) values: identity, then sin and cos at L frequencies 1, 2, 4, 8, ... (no pi)."""
-    factors = _frequencies(frequencies, values.shape[1], values.dtype, values.device)
-    angles = (values @ factors).unflatten(1, (frequencies, -1))
+    factors = _frequencies(frequencies, values.dtype, values.device)
+    angles = factors[:, None] * values[:, None, :]
     waves = torch.stack([torch.sin(angles), torch.cos(angles)], dim=2)
     return torch.cat([values, waves.flatten(1)], dim=1)
 
 
 @functools.cache
-def _frequencies(count: int, size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(D, L D) matrix of the products of D values with L frequencies, on a device; cached because creating it at each call
-    would make the host wait for the device."""
-    powers = 2 ** torch.arange(count, dtype=dtype)
-    on_device: Tensor = to_device(torch.kron(powers, torch.eye(size, dtype=dtype)), device)
+def _frequencies(count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Frequencies on a device, cached because creating them at each call would make the host wait for the device."""
+    on_device: Tensor = to_device(2 ** torch.arange(count, dtype=dtype), device)
     return on_device
 
 

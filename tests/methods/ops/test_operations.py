@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_flatten, tree_map
 
 from headbench.bench.native.dispatch import Operation
-from headbench.methods.ops import kernel, layers, photometric, planes, splats
+from headbench.methods.ops import kernel, photometric, planes, splats
 from headbench.methods.ops.photometric import mean_ssim
 from headbench.methods.shared.threads import torch_threads
 from headbench.methods.splats.cpu import instruction_sets
@@ -172,19 +172,6 @@ NETWORKS = {
 }
 
 CASES = {
-    **{
-        f"layer, {inputs} to {outputs}, slope {slope:g}": Case(
-            layers.layer,
-            lambda normal, count, inputs=inputs, outputs=outputs, slope=slope: (
-                *(normal(layers.ROWS_STEP * (count % 40), inputs), normal(outputs, inputs) / inputs**0.5),
-                *(normal(outputs), slope),
-            ),
-            (0, 1, 2),
-            tolerance=1e-5,
-            norms=True,
-        )
-        for inputs, outputs, slope in ((27, 64, 0.01), (91, 64, 0.0), (64, 3, 1.0))
-    },
     "triangle frames": Case(
         splats.triangle_frames, lambda normal, count: (normal(VERTICES, 3), faces_of(count)), (0,)
     ),
@@ -403,7 +390,7 @@ def test_bits_do_not_depend_on_the_number_of_threads(name: str) -> None:
 
 
 def test_every_operation_is_compared() -> None:
-    modules = (layers, photometric, planes, splats)
+    modules = (photometric, planes, splats)
     found = {value for module in modules for value in vars(module).values() if isinstance(value, Operation)}
     assert found == {case.operation for case in CASES.values()}
 
