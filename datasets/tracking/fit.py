@@ -6,7 +6,7 @@ length of one camera from landmarks of a head model.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple, cast
@@ -19,10 +19,18 @@ from scipy.sparse import csr_array
 from ...bench.contracts import BoolArray, Camera, FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError
 from ..head.arrays import HeadArrays
-from ..head.geometry import vertex_normals
 from .landmarks import ImageLandmarks, spread_vertices
 from .outline import Gaps, MeshOutline, Outline, OutlinePoints, gaps, static_offset
-from .rig import FrameStack, Occlusion, PointRig, PoseColumns, PosedPoints, Projection, Views
+from .rig import (
+    FrameStack,
+    Occlusion,
+    PointRig,
+    PoseColumns,
+    PosedPoints,
+    PosedSurface,
+    Projection,
+    Views,
+)
 from .settings import FOCAL_SPREAD, USUAL_FOCAL
 
 
@@ -452,8 +460,7 @@ class Fitter:
         found = cast(FloatArray, np.zeros((len(vertices), 4)))
         for level in levels:
             stack.filter(max(SHARPEST, level.blur * scale), WIDE_MM * scale)
-            samples = self._observations(state, mesh, vertices)
-            outlined = self._outlined(state, mesh, scalp)
+            samples, outlined = self._seen(state, mesh, scalp)
             for _ in range(level.steps):
                 progress(done, total, f"blur of {level.blur:g} mm")
                 equations = NormalEquations(state)
@@ -468,23 +475,41 @@ class Fitter:
                 done += 1
         return Fitted(state, landmarks, colours, found)
 
-    def _outlined(self, state: HeadState, mesh: PointRig, scalp: bool) -> list[OutlinedView]:
-        """The outlines of the posed meshes in images with masks."""
-        if not any(self.outlines):
+    def _seen(self, state: HeadState, mesh: PointRig, scalp: bool) -> tuple[Observations, list[OutlinedView]]:
+        """The vertices that each frame sees, and the outlines of the posed meshes."""
+        frames, points, weights, outlined = [], [], [], []
+        finder = MeshOutline(self.head, scalp)
+        for row, surface in enumerate(self._surfaces(state, mesh)):
+            cosine = surface.visible(self.vertices)
+            camera, point = np.nonzero(cosine)
+            frames.append(row * len(cosine) + camera)
+            points.append(point)
+            weights.append(cosine[camera, point])
+            outlined += self._outlined(row, surface, mesh, finder)
+        return Observations(np.concatenate(frames), np.concatenate(points), np.concatenate(weights)), outlined
+
+    def _surfaces(self, state: HeadState, mesh: PointRig) -> Iterator[PosedSurface]:
+        """The posed mesh of each timestep."""
+        occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), self.views)
+        for pose in state.poses:
+            yield occlusion.surface(mesh.points(state.shape, pose).astype(np.float64))
+
+    def _outlined(
+        self, row: int, surface: PosedSurface, mesh: PointRig, finder: MeshOutline
+    ) -> list[OutlinedView]:
+        """The outline of a posed mesh in images with masks."""
+        cameras = len(self.views.cameras)
+        outlines = self.outlines[row * cameras : (row + 1) * cameras]
+        if not any(outlines):
             return []
-        finder = MeshOutline(self.head, mesh.points(state.shape, state.poses[0]), self.views, scalp)
-        faces, result = np.asarray(self.head.faces), []
-        for row, pose in enumerate(state.poses):
-            posed = mesh.points(state.shape, pose).astype(np.float64)
-            normals = vertex_normals(posed, faces)
-            for camera, points in enumerate(finder.points(posed)):
-                outline = self.outlines[row * len(self.views.cameras) + camera]
-                if outline is None or not len(points.corners):
-                    continue
-                mixed = np.einsum("nk,nki->ni", points.weights, normals[points.corners])
-                outward = (mixed @ self.views.rotations[camera].T)[:, :2]
-                outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-                result.append(OutlinedView(row, camera, outline, points, mesh.mixed(*points), outward))
+        result = []
+        for camera, (outline, points) in enumerate(zip(outlines, finder.points(surface), strict=True)):
+            if outline is None or not len(points.corners):
+                continue
+            mixed = np.einsum("nk,nki->ni", points.weights, surface.normals[points.corners])
+            outward = (mixed @ self.views.rotations[camera].T)[:, :2]
+            outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+            result.append(OutlinedView(row, camera, outline, points, mesh.mixed(*points), outward))
         return result
 
     def _gaps(self, view: OutlinedView, points: FloatArray) -> tuple[Gaps, Projection, FloatArray]:
@@ -511,7 +536,7 @@ class Fitter:
         """(V, 3) static offset, metres, that moves the outline of the mesh to those of the masks."""
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
         parts, distances = [], []
-        for view in self._outlined(state, mesh, True):
+        for view in self._seen(state, mesh, True)[1]:
             points = view.rig.points(state.shape, state.poses[view.row])
             found, _, per_metre = self._gaps(view, points)
             kept = found.aligned > 0
@@ -526,18 +551,6 @@ class Fitter:
     def _pixels_per_millimetre(self, mesh: PointRig, state: HeadState) -> float:
         depth = self.views.place(mesh.points(state.shape, state.poses[0]))[1]
         return float(np.median(1e-3 * self.views.intrinsics[:, 0, 0] / np.median(depth, axis=1)))
-
-    def _observations(self, state: HeadState, mesh: PointRig, vertices: IntArray) -> Observations:
-        """The vertices that each frame sees."""
-        occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), self.views)
-        frames, points, weights = [], [], []
-        for row, pose in enumerate(state.poses):
-            cosine = occlusion.visible(mesh.points(state.shape, pose).astype(np.float64), vertices)
-            camera, point = np.nonzero(cosine)
-            frames.append(row * len(cosine) + camera)
-            points.append(point)
-            weights.append(cosine[camera, point])
-        return Observations(np.concatenate(frames), np.concatenate(points), np.concatenate(weights))
 
     def _add_colours(
         self,

@@ -13,7 +13,7 @@ from skimage.measure import find_contours
 
 from ...bench.contracts import ByteArray, FloatArray, HeadAsset, IntArray
 from ..head.geometry import mesh_edges, unique_pairs, vertex_normals
-from .rig import Occlusion, Views
+from .rig import PosedSurface
 
 REGIONS = ("face", "ears", "scalp", "neck")
 """Regions whose outline is compared; the lower half of the neck is left out, since masks contain shoulders."""
@@ -69,39 +69,32 @@ class OutlinePoints(NamedTuple):
 
 
 class MeshOutline:
-    """Finds the outline of posed meshes. ``head``: Head model. ``neutral``: (V, 3) a mesh of the subject's size.
-    ``scalp``: Whether the scalp is compared."""
+    """Finds the outline of posed meshes of a head model. ``scalp``: Whether the scalp is compared."""
 
-    def __init__(self, head: HeadAsset, neutral: FloatArray, views: Views, scalp: bool):
-        self._occlusion = Occlusion(head, neutral, views)
-        faces = np.asarray(head.faces)
-        used = np.zeros(len(neutral), bool)
+    def __init__(self, head: HeadAsset, scalp: bool):
+        height = np.asarray(head.template)[:, 1]
+        used = np.zeros(len(height), bool)
         for name in REGIONS:
             used[np.asarray(head.regions.get(name, ()), np.int64)] = True
         neck = np.asarray(head.regions.get("neck", ()), np.int64)
-        height = np.asarray(head.template)[:, 1]
         low = neck[height[neck] < np.median(height[neck])] if len(neck) else neck
         left_out = ("boundary", "mouth_socket") if scalp else ("boundary", "mouth_socket", "scalp")
         for members in (low, *(head.regions.get(name, ()) for name in left_out)):
             used[np.asarray(members, np.int64)] = False
-        edges = unique_pairs(np.sort(mesh_edges(faces), axis=1))[0]
+        edges = unique_pairs(np.sort(mesh_edges(np.asarray(head.faces)), axis=1))[0]
         self._edges = edges[used[edges].all(axis=1)]
 
-    def points(self, mesh: FloatArray) -> list[OutlinePoints]:
-        """Of a posed mesh (V, 3), for each camera."""
-        result = []
-        cosines = self._occlusion.cosines(mesh)
-        crossing = [np.flatnonzero((row[self._edges] > 0).sum(axis=1) == 1) for row in cosines]
-        every = self._edges[np.concatenate(crossing)]
-        shares = np.concatenate([_zero(row[self._edges[some]]) for row, some in zip(cosines, crossing)])
-        places = np.einsum("nk,nki->ni", shares, mesh[every])
-        border = self._occlusion.at_border(mesh, places)
-        start = 0
-        for camera, some in enumerate(crossing):
-            part = slice(start, start := start + len(some))
-            kept = border[camera, part]
-            result.append(OutlinePoints(every[part][kept], shares[part][kept]))
-        return result
+    def points(self, surface: PosedSurface) -> list[OutlinePoints]:
+        """Of a posed mesh, for each camera."""
+        ends = surface.cosines(self._edges.ravel()).reshape(-1, *self._edges.shape)
+        cameras, edges = np.nonzero((ends > 0).sum(axis=2) == 1)
+        corners, shares = self._edges[edges], _zero(ends[cameras, edges])
+        border = surface.at_border(np.einsum("nk,nki->ni", shares, surface.mesh[corners]))
+        kept = border[cameras, np.arange(len(cameras))]
+        return [
+            OutlinePoints(corners[kept & (cameras == camera)], shares[kept & (cameras == camera)])
+            for camera in range(len(ends))
+        ]
 
 
 def _zero(values: FloatArray) -> FloatArray:

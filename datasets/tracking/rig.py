@@ -158,53 +158,59 @@ class Occlusion:
             shares = np.concatenate([1 - grid.sum(axis=1, keepdims=True), grid], axis=1)
             self._samples.append((corners[number == steps], shares))
 
+    def surface(self, mesh: FloatArray) -> PosedSurface:
+        """A posed mesh (V, 3), metres, in the cameras."""
+        points = [mesh] + [
+            np.einsum("sk,fki->fsi", shares, mesh[faces]).reshape(-1, 3) for faces, shares in self._samples
+        ]
+        return PosedSurface(mesh, vertex_normals(mesh, self._faces), self._views, np.concatenate(points))
+
     def visible(self, mesh: FloatArray, vertices: IntArray) -> FloatArray:
-        """(C, n) cosine between normal and direction to the camera at vertices that are seen, else 0. ``mesh``: (V, 3)
-        posed mesh, metres. ``vertices``: (n,) vertices."""
-        cosine = self.cosines(mesh)[:, vertices]
-        nearest = self._buffer(mesh)
-        pixels, depth = self._views.place(mesh[vertices])
+        """`PosedSurface.visible` of a posed mesh (V, 3), metres."""
+        return self.surface(mesh).visible(vertices)
+
+
+class PosedSurface:
+    """A posed mesh in the images of C cameras, with the nearest depth in every cell. ``mesh``: (V, 3) metres. ``normals``: (V, 3)
+    of its vertices. ``points``: Dense points of its surface."""
+
+    def __init__(self, mesh: FloatArray, normals: FloatArray, views: Views, points: FloatArray):
+        self.mesh, self.normals, self._views = mesh, normals, views
+        self._rows, self._columns = views.sizes.max(axis=0)[::-1] // CELL + 1
+        pixels, depth = views.place(points)
+        cells, inside = self._cells(pixels)
+        self._nearest = np.full((len(cells), self._rows * self._columns), np.inf, np.float32)
+        for camera, (row, kept) in enumerate(zip(cells, inside)):
+            np.minimum.at(self._nearest[camera], row[kept], depth[camera, kept])
+
+    def cosines(self, vertices: IntArray) -> FloatArray:
+        """(C, n) cosine between normal and direction to the camera at vertices (n,)."""
+        toward = self._views.centers[:, None] - self.mesh[vertices]
+        cosine = np.einsum("cni,ni->cn", toward, self.normals[vertices])
+        return np.asarray(cosine / np.linalg.norm(toward, axis=2))
+
+    def visible(self, vertices: IntArray) -> FloatArray:
+        """`cosines` at vertices (n,) that are seen, else 0."""
+        cosine = self.cosines(vertices)
+        pixels, depth = self._views.place(self.mesh[vertices])
         cells, inside = self._cells(pixels)
         rows = np.arange(len(cosine))[:, None]
         slope = np.sqrt(1 - np.minimum(cosine**2, 1)) / np.maximum(cosine, FACING)
         margin = MARGIN + slope * CELL * depth / self._views.intrinsics[:, None, 0, 0]
-        seen = inside & (depth < nearest[rows, cells] + margin) & (cosine > FACING)
+        seen = inside & (depth < self._nearest[rows, cells] + margin) & (cosine > FACING)
         return np.where(seen, cosine, 0.0)
 
-    def cosines(self, mesh: FloatArray) -> FloatArray:
-        """(C, V) cosine between normal and direction to the camera at all vertices of a posed mesh (V, 3)."""
-        toward = self._views.centers[:, None] - mesh
-        normals = vertex_normals(mesh, self._faces)
-        return np.asarray(np.einsum("cni,ni->cn", toward, normals) / np.linalg.norm(toward, axis=2))
-
-    def at_border(self, mesh: FloatArray, points: FloatArray) -> BoolArray:
+    def at_border(self, points: FloatArray) -> BoolArray:
         """(C, n) whether points (n, 3) are in the image and within a cell of the border of the mesh's projection."""
-        width, height = self._views.sizes.max(axis=0) // CELL + 1
-        covered = np.isfinite(self._buffer(mesh)).reshape(-1, height, width)
-        closed = np.stack([ndimage.binary_closing(one, np.ones((3, 3)), border_value=0) for one in covered])
-        inner = np.stack([ndimage.binary_erosion(one, np.ones((3, 3)), border_value=1) for one in closed])
+        covered = np.isfinite(self._nearest).reshape(-1, self._rows, self._columns)
+        closed = ndimage.binary_closing(covered, np.ones((1, 3, 3)), border_value=0)
+        inner = ndimage.binary_erosion(closed, np.ones((1, 3, 3)), border_value=1).reshape(len(covered), -1)
         cells, inside = self._cells(self._views.place(points)[0])
-        return inside & ~inner.reshape(len(inner), -1)[np.arange(len(inner))[:, None], cells]
-
-    def _buffer(self, mesh: FloatArray) -> FloatArray:
-        """(C, cells) nearest depth of a posed mesh (V, 3)."""
-        surface = [mesh] + [
-            np.einsum("sk,fki->fsi", shares, mesh[faces]).reshape(-1, 3) for faces, shares in self._samples
-        ]
-        points = np.concatenate(surface)
-        width, height = self._views.sizes.max(axis=0) // CELL + 1
-        pixels, depth = self._views.place(points)
-        cells, inside = self._cells(pixels)
-        count = width * height
-        nearest = np.full((len(cells), count), np.inf, np.float32)
-        for camera, (row, kept) in enumerate(zip(cells, inside)):
-            np.minimum.at(nearest[camera], row[kept], depth[camera, kept])
-        return nearest
+        return inside & ~inner[np.arange(len(inner))[:, None], cells]
 
     def _cells(self, pixels: FloatArray) -> tuple[IntArray, BoolArray]:
         """Cell of each point, (C, P), and whether it is in the image."""
         sizes = self._views.sizes[:, None]
-        width, height = self._views.sizes.max(axis=0) // CELL + 1
         inside = (
             (pixels[..., 0] >= 0)
             & (pixels[..., 1] >= 0)
@@ -212,8 +218,8 @@ class Occlusion:
             & (pixels[..., 1] < sizes[..., 1])
         )
         at = (pixels * np.float32(1 / CELL)).astype(np.int32)
-        x, y = np.clip(at[..., 0], 0, width - 1), np.clip(at[..., 1], 0, height - 1)
-        return y * width + x, inside
+        x, y = np.clip(at[..., 0], 0, self._columns - 1), np.clip(at[..., 1], 0, self._rows - 1)
+        return y * self._columns + x, inside
 
 
 JOINTS = len(JOINT_NAMES)

@@ -9,7 +9,7 @@ from headbench.datasets.head.geometry import vertex_normals
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.mesh_pictures import rasterize_mesh
 from headbench.datasets.tracking.outline import MeshOutline, OutlinePoints, gaps, outline_of, static_offset
-from headbench.datasets.tracking.rig import Views
+from headbench.datasets.tracking.rig import Occlusion, Views
 
 SIZE = 256
 
@@ -54,7 +54,7 @@ def test_points_of_the_mesh_are_on_the_outline_that_is_drawn(head, camera):
     mesh = np.asarray(head.template, np.float64)
     mask = np.where(rasterize_mesh(mesh, head.faces, camera).face >= 0, 255, 0).astype(np.uint8)
     views = Views([camera])
-    (points,) = MeshOutline(head, mesh, views, scalp=True).points(mesh)
+    (points,) = MeshOutline(head, scalp=True).points(Occlusion(head, mesh, views).surface(mesh))
     assert len(points.corners) > 100
     places = np.einsum("nk,nki->ni", points.weights, mesh[points.corners])
     normals = np.einsum("nk,nki->ni", points.weights, vertex_normals(mesh, head.faces)[points.corners])
@@ -68,7 +68,7 @@ def test_points_of_the_mesh_are_on_the_outline_that_is_drawn(head, camera):
 
 def test_a_static_offset_follows_the_scalp_and_keeps_the_eyes(head, camera):
     mesh = np.asarray(head.template, np.float64)
-    (points,) = MeshOutline(head, mesh, Views([camera]), scalp=True).points(mesh)
+    (points,) = MeshOutline(head, scalp=True).points(Occlusion(head, mesh, Views([camera])).surface(mesh))
     hair = np.isin(points.corners, head.regions["scalp"]).all(axis=1)
     frames = 64
     chosen = OutlinePoints(
