@@ -203,7 +203,7 @@ def comparisons(
 def with_common_frames(runs: Sequence[RunData]) -> tuple[list[RunData], list[str]]:
     """Runs of the same methods with the rows of frames whose pictures all have, and sentences on how many these are.
 
-    Trackers leave out frames, and captures number the others anew; so frames are identified by their pictures.
+    Trackers leave out frames, and captures number the others again; so frames are identified by their pictures.
     """
     first, counts = runs[0], []
     chosen: list[dict[str, list[FrameKey]]] = [{} for _ in runs]

@@ -1,8 +1,4 @@
-"""Fit a head model to images: landmarks first, then colours of surface points.
-
-Gauss-Newton steps for the poses of all timesteps and one shape: normal equations with an arrowhead matrix. The focal
-length of one camera from landmarks of a head model.
-"""
+"""Fit a head model to images: landmarks first, then colours of surface points, outlines and landmarks."""
 
 from __future__ import annotations
 
@@ -13,159 +9,29 @@ from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
-from scipy.linalg import solveh_banded
 from scipy.sparse import csr_array
 
-from ...bench.contracts import BoolArray, Camera, FloatArray, HeadAsset, IntArray, Progress, no_progress
+from ...bench.contracts import BoolArray, FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError
 from ..head.arrays import HeadArrays
+from .equations import HeadPrior, HeadState, NormalEquations
 from .landmarks import ImageLandmarks, spread_vertices
 from .outline import Gaps, MeshOutline, Outline, OutlinePoints, gaps, static_offset
 from .rig import (
     FrameStack,
+    MeshInViews,
     Occlusion,
     PointRig,
     PoseColumns,
     PosedPoints,
-    PosedSurface,
     Projection,
     Views,
 )
-from .settings import FOCAL_SPREAD, USUAL_FOCAL
-
-
-class HeadState(NamedTuple):
-    """Estimate of a tracker."""
-
-    shape: FloatArray
-    """(S,) identity coefficients."""
-    poses: FloatArray
-    """(T, D) columns of `PoseColumns`."""
-
-
-class HeadPrior(NamedTuple):
-    """Expected magnitudes of the parameters; infinity disables the prior, 0 fixes the parameter."""
-
-    pose: FloatArray
-    """(D,) standard deviations around 0."""
-    shape: FloatArray
-    """(S,) the same."""
 
 
 def with_offset(head: HeadArrays, offset: FloatArray) -> HeadArrays:
     """The head model with a static offset (V, 3) in its template."""
     return replace(head, template=np.asarray(head.template + offset, head.template.dtype))
-
-
-class NormalEquations:
-    """Sums of ``J' A J`` and ``J' b`` over points, for T timesteps with D parameters each and S shared ones.
-
-    ``state``: Estimate with these sizes.
-    """
-
-    def __init__(self, state: HeadState):
-        timesteps, self._split = state.poses.shape
-        whole = self._split + len(state.shape)
-        self._matrices = np.zeros((timesteps, whole, whole))
-        self._rights = np.zeros((timesteps, whole))
-        self._links: FloatArray | None = None
-
-    def add(self, timestep: int, posed: PosedPoints, curvature: FloatArray, slope: FloatArray) -> None:
-        """Add the points of a timestep.
-
-        ``posed``: P points and their derivatives. ``curvature``: (P, 3, 3) second derivatives of the cost by the points,
-        without those of the residuals. ``slope``: (P, 3) negative first derivatives of the cost by the points.
-        """
-        jacobian = np.concatenate([posed.by_pose, posed.by_shape], axis=2)
-        bent = np.einsum("pij,pjk->pik", curvature.astype(jacobian.dtype), jacobian)
-        width = jacobian.shape[2]
-        flat = jacobian.reshape(-1, width)
-        self._matrices[timestep] += flat.T @ bent.reshape(-1, width)
-        self._rights[timestep] += flat.T @ slope.astype(jacobian.dtype).reshape(-1)
-
-    def add_residuals(
-        self, timestep: int, jacobian: FloatArray, weight: FloatArray, residual: FloatArray
-    ) -> None:
-        """Add residuals (n,) of a timestep with weights (n,) and derivatives (n, D + S) of the estimated values."""
-        weighted = jacobian * weight[:, None]
-        self._matrices[timestep] += jacobian.T @ weighted
-        self._rights[timestep] += weighted.T @ residual
-
-    def link(self, poses: FloatArray, deviations: FloatArray) -> None:
-        """Expect consecutive poses (T, D) to differ by standard deviations (T - 1, D); infinity for none."""
-        stiffness = deviations**-2.0
-        pull = stiffness * np.diff(poses, axis=0)
-        pose = np.arange(self._split)
-        self._links = stiffness
-        self._matrices[:-1, pose, pose] += stiffness
-        self._matrices[1:, pose, pose] += stiffness
-        self._rights[:-1, pose] += pull
-        self._rights[1:, pose] -= pull
-
-    def step(self, state: HeadState, prior: HeadPrior, damping: float = 1e-6) -> HeadState:
-        """The state after a step with the prior. ``damping``: Fraction of the diagonal that is added to it
-        (Levenberg-Marquardt)."""
-        split = self._split
-        deviations = np.concatenate([prior.pose, prior.shape])
-        free = deviations > 0
-        with np.errstate(divide="ignore"):
-            stiffness = np.where(free, 1 / deviations**2, 0.0)
-        count = len(self._matrices)
-        values = np.concatenate(
-            [state.poses, np.broadcast_to(state.shape, (count, len(state.shape)))], axis=1
-        )
-        # The shape has one prior, divided among the timesteps.
-        stiffness[split:] /= count
-        matrices = self._matrices * (free[:, None] & free)
-        rights = (self._rights - stiffness * values) * free
-        size = len(free)
-        diagonal = np.arange(size)
-        matrices[:, diagonal, diagonal] += (
-            stiffness + damping * matrices[:, diagonal, diagonal] + 1e-9 + ~free
-        )
-        if self._links is not None:  # the shape is fixed
-            return state._replace(poses=state.poses + _chain(matrices, rights[:, :split], self._links))
-        own, mixed, corner = (
-            matrices[:, :split, :split],
-            matrices[:, :split, split:],
-            matrices[:, split:, split:],
-        )
-        solved = np.linalg.solve(own, np.concatenate([rights[:, :split, None], mixed], axis=2))
-        schur = corner.sum(axis=0) - np.einsum("tds,tdr->sr", mixed, solved[:, :, 1:])
-        right = rights[:, split:].sum(axis=0) - np.einsum("tds,td->s", mixed, solved[:, :, 0])
-        change = np.linalg.solve(schur, right) if len(right) else right
-        return HeadState(state.shape + change, state.poses + solved[:, :, 0] - solved[:, :, 1:] @ change)
-
-
-def _chain(matrices: FloatArray, rights: FloatArray, links: FloatArray) -> FloatArray:
-    """(T, D) solution of systems of which each is linked with the next one. ``matrices``: (T, D or more, the same), symmetric.
-    ``links``: (T - 1, D) negative derivatives between the same parameters of consecutive timesteps."""
-    count, size = rights.shape
-    bands = np.zeros((size + 1, count * size))
-    for below in range(size):
-        diagonal = np.diagonal(matrices[:, :size, :size], -below, 1, 2)  # (T, size - below)
-        bands[below].reshape(count, size)[:, : size - below] = diagonal
-    bands[size, : (count - 1) * size] = -links.ravel()
-    return np.asarray(solveh_banded(bands, rights.ravel(), lower=True)).reshape(count, size)
-
-
-def continuous(poses: FloatArray) -> FloatArray:
-    """Poses (T, D) whose rotation vectors (the first three columns) differ least from those of the timestep before. A head that
-    faces a camera is turned by about half a turn, where there are two vectors for about the same rotation."""
-    result = poses.copy()
-    for before, after in pairwise(result):
-        angle = max(float(np.linalg.norm(after[:3])), 1e-9)
-        other = after[:3] * (1 - 2 * np.pi / angle)
-        if np.linalg.norm(other - before[:3]) < np.linalg.norm(after[:3] - before[:3]):
-            after[:3] = other
-    return result
-
-
-def motion_spread(timesteps: Sequence[int], seconds: float, size: int) -> FloatArray:
-    """(T - 1, D) standard deviations of the differences between poses of consecutive timesteps, ``seconds`` apart."""
-    angles, translation, coefficient = SPEED
-    usual = np.array([*angles, *(translation,) * 3, *(coefficient,) * (size - len(angles) - 3)])
-    return np.asarray(seconds * np.diff(timesteps)[:, None] * usual)
 
 
 ANGLE_SPREAD = (np.inf,) * 3 + (0.15,) * 3 + (0.3, 0.03, 0.02) + (0.2, 0.3, 0.02) * 2
@@ -209,8 +75,6 @@ LEVELS = (
 errors of landmarks are correlated over time and those of points in space, so that sums over them overstate certainty."""
 LAST = BlurLevel(0.7, 3, 4.0, 0.01)
 """Of the final pass over all timesteps."""
-SPEED = ((1.5,) * 6 + (3.0, 1.0, 1.0) + (np.inf,) * 6, 0.3, 15.0)
-"""Usual speeds: of angles, radians, the translation, metres, and coefficients, each in a second. Eyes jump."""
 COARSE = 2
 """Number of levels before the static offset is estimated."""
 SHARPEST = 0.7
@@ -445,8 +309,8 @@ class Fitter:
         """Steps on colours of points, landmarks and outlines at the blurs of ``levels``.
 
         ``stack`` holds the images of all timesteps, the cameras of each together. ``scalp``: Whether the outline of the scalp
-        counts, which the static offset moves to that of the hair. ``last``: In the final pass, colours of all timesteps, as
-        `Fitted.texture`, and `motion_spread`; the shape is kept.
+        counts, which the static offset moves to that of the hair. ``last``: In the final pass, the vertices' colours (P, 3)
+        and `motion_spread`; the shape is kept.
         """
         texture, motion = last or (None, None)
         levels, keep_shape = (levels, keep_shape) if last is None else ([LAST], True)
@@ -488,14 +352,14 @@ class Fitter:
             outlined += self._outlined(row, surface, mesh, finder)
         return Observations(np.concatenate(frames), np.concatenate(points), np.concatenate(weights)), outlined
 
-    def _surfaces(self, state: HeadState, mesh: PointRig) -> Iterator[PosedSurface]:
+    def _surfaces(self, state: HeadState, mesh: PointRig) -> Iterator[MeshInViews]:
         """The posed mesh of each timestep."""
         occlusion = Occlusion(self.head, mesh.points(state.shape, state.poses[0]), self.views)
         for pose in state.poses:
             yield occlusion.surface(mesh.points(state.shape, pose).astype(np.float64))
 
     def _outlined(
-        self, row: int, surface: PosedSurface, mesh: PointRig, finder: MeshOutline
+        self, row: int, surface: MeshInViews, mesh: PointRig, finder: MeshOutline
     ) -> list[OutlinedView]:
         """The outline of a posed mesh in images with masks."""
         cameras = len(self.views.cameras)
@@ -563,7 +427,7 @@ class Fitter:
         known: FloatArray | None,
     ) -> tuple[FloatArray, FloatArray]:
         """Add the colours to the equations; return their median difference at each timestep, (T,) 8-bit levels, and the
-        `Fitted.texture`, which is ``known`` if that is given."""
+        `Fitted.texture`, with the ``known`` colours (P, 3) if they are given."""
         cameras = len(self.views.cameras)
         bounds = np.searchsorted(samples.frame, np.arange(len(state.poses) + 1) * cameras)
         posed = [rig.points(state.shape, pose) for pose in state.poses]
@@ -596,10 +460,10 @@ def _texture(
     values: FloatArray, samples: Observations, points: int, tolerance: float, known: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Robust colour of every point (P, 3), the Geman-McClure weight of every observation (n,), over its variance, and the sum of
-    the weights of every point (P,), not over it. ``known``: (P, 4) colours and weights that are kept instead."""
+    the weights of every point (P,), not over it. ``known``: (P, 3) colours that are kept instead."""
     weight = samples.weight.astype(np.float32)
     robust = weight
-    texture: FloatArray = np.zeros((points, 3)) if known is None else known[:, :3]
+    texture: FloatArray = np.zeros((points, 3)) if known is None else known
     for _ in range(4):
         total = np.maximum(np.bincount(samples.point, robust, points), 1e-9)
         if known is None:
@@ -611,68 +475,3 @@ def _texture(
         scale = tolerance * np.maximum(mean_square, max(float(np.median(square)), 1e-5))[samples.point]
         robust = weight / (1 + square / scale) ** 2
     return texture.astype(np.float32), (3 * robust / scale).astype(np.float32), total
-
-
-TRIED = tuple(np.geomspace(0.8, 6.0, 10))
-"""Focal lengths relative to the longer side of the picture."""
-FRAMES = 16
-WEIGHT = 1.0
-"""Weight of a landmark relative to the prior. With that of tracking, residuals due to the prior would hide perspective."""
-CLEAR = 1.02
-"""Minimum ratio of the residuals at both ends of `TRIED` to the smallest one for a determined focal length."""
-INDEPENDENT = 50
-"""Number of independent residuals that all landmarks are worth, since their errors are correlated."""
-
-
-class FocalLength(NamedTuple):
-    """An estimate."""
-
-    pixels: float
-    residuals: FloatArray
-    """(N,) root mean square distance of landmarks, pixels, at each tried focal length."""
-    tried: FloatArray
-    """(N,) pixels."""
-
-    @property
-    def source(self) -> str:
-        """Whether the landmarks determine the focal length, in words."""
-        if self.residuals[[0, -1]].min() > CLEAR * self.residuals.min():
-            return "estimated from landmarks"
-        return "assumed, since the landmarks hardly determine it; give --focal if you know it"
-
-
-def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, side: float) -> FocalLength:
-    """The most probable focal length of one camera by landmarks of a head model and the prior of `USUAL_FOCAL`.
-
-    Shape, poses and expressions are fitted for each tried length; between them the minimum of a parabola in its logarithm is
-    taken. Landmarks have systematic errors of some millimetres, and a near face with a short lens looks like a longer face, so that
-    the estimate may be wrong by a quarter.
-
-    ``landmarks``: (T, 1, L, 2) pixels of ``camera``. ``side``: Longer side of the camera's whole picture in pixels of
-    ``camera``, before it was cropped.
-    """
-    sample = landmarks.of(landmarks.seen)
-    sample = sample.of(np.unique(np.linspace(0, len(sample.pixels) - 1, FRAMES).astype(int)))
-    tried = side * np.array(TRIED)
-    residuals = np.array([_residual(head, camera, sample, focal) for focal in tried])
-    improbable = INDEPENDENT * np.log(residuals) + (np.log(TRIED) - np.log(USUAL_FOCAL)) ** 2 / (
-        2 * FOCAL_SPREAD**2
-    )
-    best = int(improbable.argmin())
-    pixels = tried[best]
-    if 0 < best < len(tried) - 1:
-        below, least, above = improbable[best - 1 : best + 2]
-        step = 0.5 * (below - above) / (below - 2 * least + above)
-        pixels = tried[best] * (tried[best + 1] / tried[best]) ** step
-    return FocalLength(float(pixels), residuals, tried)
-
-
-def _residual(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, focal: float) -> float:
-    K = np.array(camera.K, np.float64)
-    K[0, 0] = K[1, 1] = focal
-    views = Views([Camera(camera.id, camera.width, camera.height, K, camera.world_to_camera)])
-    fitter = Fitter(head, views, landmarks, np.zeros(0, np.int64))
-    state = fitter.fit_landmarks(fitter.start(), weight=WEIGHT)
-    equations = NormalEquations(state)
-    distances = fitter.add_landmarks(equations, fitter.landmark_rig(), state, WEIGHT)
-    return float(np.sqrt(np.mean(distances**2)))

@@ -13,7 +13,7 @@ from skimage.measure import find_contours
 
 from ...bench.contracts import ByteArray, FloatArray, HeadAsset, IntArray
 from ..head.geometry import mesh_edges, unique_pairs, vertex_normals
-from .rig import PosedSurface
+from .rig import MeshInViews
 
 REGIONS = ("face", "ears", "scalp", "neck")
 """Regions whose outline is compared; the lower half of the neck is left out, since masks contain shoulders."""
@@ -84,7 +84,7 @@ class MeshOutline:
         edges = unique_pairs(np.sort(mesh_edges(np.asarray(head.faces)), axis=1))[0]
         self._edges = edges[used[edges].all(axis=1)]
 
-    def points(self, surface: PosedSurface) -> list[OutlinePoints]:
+    def points(self, surface: MeshInViews) -> list[OutlinePoints]:
         """Of a posed mesh, for each camera."""
         ends = surface.cosines(self._edges.ravel()).reshape(-1, *self._edges.shape)
         cameras, edges = np.nonzero((ends > 0).sum(axis=2) == 1)

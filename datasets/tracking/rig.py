@@ -158,19 +158,19 @@ class Occlusion:
             shares = np.concatenate([1 - grid.sum(axis=1, keepdims=True), grid], axis=1)
             self._samples.append((corners[number == steps], shares))
 
-    def surface(self, mesh: FloatArray) -> PosedSurface:
+    def surface(self, mesh: FloatArray) -> MeshInViews:
         """A posed mesh (V, 3), metres, in the cameras."""
         points = [mesh] + [
             np.einsum("sk,fki->fsi", shares, mesh[faces]).reshape(-1, 3) for faces, shares in self._samples
         ]
-        return PosedSurface(mesh, vertex_normals(mesh, self._faces), self._views, np.concatenate(points))
+        return MeshInViews(mesh, vertex_normals(mesh, self._faces), self._views, np.concatenate(points))
 
     def visible(self, mesh: FloatArray, vertices: IntArray) -> FloatArray:
-        """`PosedSurface.visible` of a posed mesh (V, 3), metres."""
+        """`MeshInViews.visible` of a posed mesh (V, 3), metres."""
         return self.surface(mesh).visible(vertices)
 
 
-class PosedSurface:
+class MeshInViews:
     """A posed mesh in the images of C cameras, with the nearest depth in every cell. ``mesh``: (V, 3) metres. ``normals``: (V, 3)
     of its vertices. ``points``: Dense points of its surface."""
 

@@ -27,7 +27,8 @@ from ..ga.writer import save_npz
 from ..head.geometry import fit_sphere
 from ..head.model import PosedSubject
 from ..open import open_clip
-from .fit import Fitter, HeadState, continuous, motion_spread, sampled_vertices, with_offset
+from .equations import HeadState, continuous, motion_spread
+from .fit import Fitter, sampled_vertices, with_offset
 from .landmarks import ImageLandmarks, landmark_source
 from .outline import outline_of
 from .rig import FrameStack, PoseColumns, Views, outliers
@@ -299,6 +300,7 @@ class _Fits:
     offset: FloatArray | None = None
     seconds: float = 0.0
     textures: list[FloatArray] = field(default_factory=list)
+    """`Fitted.texture` of each part."""
     poses: dict[int, FloatArray] = field(default_factory=dict)
     """(D,) each."""
     residuals: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -344,8 +346,7 @@ class _Fits:
         known = sorted({*self.poses} - self.outliers())
         former = {timestep: (self.poses[timestep], self.residuals[timestep]) for timestep in known}
         total = np.maximum(np.sum([one[:, 3:] for one in self.textures], axis=0), 1e-9)
-        colours = np.sum([one[:, :3] * one[:, 3:] for one in self.textures], axis=0) / total
-        texture = np.concatenate([colours, total], axis=1)
+        texture = np.sum([one[:, :3] * one[:, 3:] for one in self.textures], axis=0) / total
         most = max(1, int(MOST_PIXELS / 4 // self.views.sizes.prod(axis=1).sum()))
         parts = [part.tolist() for part in np.array_split(known, -(-len(known) // most) or 1) if len(part)]
         for number, part in enumerate(parts):
@@ -378,7 +379,7 @@ class LastPass(NamedTuple):
     """Inputs of the final pass over consecutive timesteps."""
 
     texture: FloatArray
-    """(P, 4) as `Fitted.texture`."""
+    """(P, 3) colours of the sampled vertices."""
     seconds: float
     """Between timesteps; 0 where it is not known."""
 

@@ -17,7 +17,7 @@ from ...bench.landmark_network import COUNT, fetched_network
 from ...bench.progress import counted
 from ..clip import CaptureClip
 from ..head.refit.command import target_head
-from ..tracking.fit import FocalLength, estimate_focal
+from ..tracking.focal import FocalLength, estimate_focal
 from ..tracking.landmarks import Embedding, NetworkLandmarks, head_embedding
 from ..tracking.settings import TRACKER_VERSION, make_work_folder
 from .clip import FrameView, VideoClip, open_video

@@ -20,9 +20,9 @@ from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.images import write_image
 from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
 from headbench.datasets.tracking import command as tracking_command
-from headbench.datasets.tracking import fit, landmarks, track
+from headbench.datasets.tracking import fit, focal, landmarks, track
 from headbench.datasets.tracking.command import track_capture
-from headbench.datasets.tracking.fit import FocalLength, estimate_focal
+from headbench.datasets.tracking.focal import FocalLength, estimate_focal
 from headbench.datasets.tracking.landmarks import ImageLandmarks, spread_vertices
 from headbench.datasets.tracking.settings import WORK, TrackSettings
 from headbench.datasets.video import clip as video_clip
@@ -122,7 +122,7 @@ def settings(filmed, monkeypatch, tmp_path):
     monkeypatch.setattr(fit, "LEVELS", fit.LEVELS[:1])  # landmarks alone are exact here
     monkeypatch.setattr(fit, "COARSE", 0)
     monkeypatch.setattr(fit, "LAST", fit.LEVELS[0])
-    monkeypatch.setattr(fit, "TRIED", fit.TRIED[1:6:2])
+    monkeypatch.setattr(focal, "TRIED", focal.TRIED[1:6:2])
     monkeypatch.setattr(command, "FaceFinder", Network)
     monkeypatch.setattr(video_clip, "crop_around", lambda faces, width, height: Crop(0, 0, width, height))
     given = {

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.head.model import HeadModel
-from headbench.datasets.tracking.fit import HeadPrior, HeadState, NormalEquations, continuous
+from headbench.datasets.tracking.equations import HeadPrior, HeadState, NormalEquations, continuous
 from headbench.datasets.tracking.rig import ANGLES, PointRig, PoseColumns, PosedPoints
 
 from ..head.toy import toy_head
