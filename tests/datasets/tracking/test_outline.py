@@ -58,6 +58,11 @@ def test_points_of_the_mesh_are_on_the_outline_that_is_drawn(head, camera):
     assert len(points.corners) > 100
     places = np.einsum("nk,nki->ni", points.weights, mesh[points.corners])
     normals = np.einsum("nk,nki->ni", points.weights, vertex_normals(mesh, head.faces)[points.corners])
+    toward = camera.center - places
+    seen_at = (
+        (normals * toward).sum(axis=1) / np.linalg.norm(normals, axis=1) / np.linalg.norm(toward, axis=1)
+    )
+    assert np.quantile(np.abs(seen_at), 0.9) < 0.02  # the surface is seen along its tangent
     outward = (normals @ camera.world_to_camera[:3, :3].T)[:, :2]
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     found = gaps(outline_of(mask), views.place(places)[0][0], outward)

@@ -84,3 +84,18 @@ def test_frames_of_one_part_are_not_changed():
         mask = np.full((20, 30), level, np.uint8)
         assert np.array_equal(refined_mask(image, mask, np.array([[5.0, 5.0]])), mask)
         assert np.array_equal(without_room(image, mask), image)
+
+
+def test_two_flat_colours_determine_the_coverage():
+    side = 96
+    place = np.stack(np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5), axis=2)
+    distance = np.linalg.norm(place - [50.2, 44.9], axis=2)
+    coverage = np.clip(30.5 - distance, 0, 1)[..., None]
+    frame = np.rint(coverage * [200, 40, 30] + (1 - coverage) * [20, 60, 210]).astype(np.uint8)
+    exact = np.rint(255 * coverage[..., 0]).astype(np.uint8)
+    coarse = cv2.GaussianBlur(exact, (0, 0), 2.0)
+    before, after = (
+        np.abs(mask.astype(float) - exact)[np.abs(distance - 30) < 3].mean()
+        for mask in (coarse, refined_mask(frame, coarse, np.array([[50.0, 45.0]])))
+    )
+    assert after < 0.1 * before

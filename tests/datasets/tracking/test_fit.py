@@ -1,0 +1,76 @@
+"""What outlines and pairs of landmarks contribute to a fit, on a head whose pose is known."""
+
+import numpy as np
+import pytest
+
+from headbench.bench.contracts import Camera
+from headbench.datasets.head.arrays import with_derived_regions
+from headbench.datasets.head.procedural.model import procedural_head
+from headbench.datasets.mesh_pictures import rasterize_mesh
+from headbench.datasets.tracking.equations import HeadState
+from headbench.datasets.tracking.fit import LEVELS, Fitter, sampled_vertices
+from headbench.datasets.tracking.landmarks import ImageLandmarks
+from headbench.datasets.tracking.outline import outline_of
+from headbench.datasets.tracking.rig import FrameStack, PointRig, PoseColumns, Views
+
+SIZE = 192
+
+
+@pytest.fixture(scope="module")
+def head():
+    return with_derived_regions(procedural_head("2023"))
+
+
+@pytest.fixture(scope="module")
+def camera():
+    K = np.array([[700.0, 0, SIZE / 2], [0, 700.0, SIZE / 2], [0, 0, 1]])
+    motion = np.diag([1.0, -1, -1, 1])
+    motion[:3, 3] = [0, 0, 1.0]
+    return Camera("0", SIZE, SIZE, K, motion)
+
+
+def resting(head):
+    return HeadState(np.zeros(head.shape_basis.shape[2]), np.zeros((1, PoseColumns.of(head).size)))
+
+
+@pytest.mark.parametrize(("masked", "left_mm"), [(True, 1.0), (False, 5.0)])
+def test_an_outline_moves_the_head_where_colours_say_nothing(head, camera, masked, left_mm):
+    mesh = np.asarray(head.template, np.float64)
+    mask = np.where(rasterize_mesh(mesh, head.faces, camera).face >= 0, 255, 0).astype(np.uint8)
+    nothing = ImageLandmarks(
+        np.zeros((1, 3), int), np.array([[1.0, 0, 0]]), np.full((1, 1, 1, 2), np.nan), np.zeros((0, 2), int)
+    )
+    outlines = [outline_of(mask) if masked else None]
+    fitter = Fitter(head, Views([camera]), nothing, sampled_vertices(head), outlines)
+    state = resting(head)
+    aside = PoseColumns.of(head).translation.start
+    state.poses[0, aside] = 0.005
+    grey = FrameStack([np.full((SIZE, SIZE, 3), 128, np.uint8)])
+    found = fitter.fit_colours(state, grey, levels=LEVELS[:1], keep_shape=True).state
+    rig = PointRig.at_vertices(head, np.asarray(head.regions["nose"]))
+    moved = rig.points(found.shape, found.poses[0]) - mesh[head.regions["nose"]]
+    assert abs(1e3 * moved[:, 0].mean()) == pytest.approx(left_mm, abs=1.0)
+
+
+def test_pairs_of_landmarks_open_the_mouth(head, camera):
+    columns, views = PoseColumns.of(head), Views([camera])
+    lips = np.asarray(head.regions["lips"])
+    heights = np.asarray(head.template)[lips, 1]
+    pair = lips[[np.argmax(heights), np.argmin(heights)]]
+    others = np.asarray(head.regions["nose"])[::20]
+    vertices = np.concatenate([pair, others])
+    rig = PointRig.at_vertices(head, vertices)
+    open_mouth = resting(head)
+    open_mouth.poses[0, 6] = 0.2  # jaw
+    pixels = views.project(rig.points(open_mouth.shape, open_mouth.poses[0])).pixels[None]
+    corners, weights = np.repeat(vertices[:, None], 3, axis=1), np.tile([1.0, 0, 0], (len(vertices), 1))
+
+    def gap(pairs):
+        marks = ImageLandmarks(corners, weights, pixels, np.array(pairs, int).reshape(-1, 2))
+        fitter = Fitter(head, views, marks, np.zeros(0, int))
+        found = fitter.fit_landmarks(resting(head), keep_shape=True, weight=1e-4)
+        assert found.poses.shape == (1, columns.size)
+        places = views.project(rig.points(found.shape, found.poses[0])).pixels[0]
+        return np.linalg.norm((places[0] - places[1]) - (pixels[0, 0, 0] - pixels[0, 0, 1]))
+
+    assert gap([(0, 1)]) < 0.5 * gap([])
