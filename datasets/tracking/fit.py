@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from ...bench.contracts import BoolArray, FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError
 from ..head.arrays import HeadArrays
-from .equations import HeadPrior, HeadState, NormalEquations
+from .equations import HeadPrior, HeadState, NormalEquations, continuous
 from .landmarks import ImageLandmarks, spread_vertices
 from .outline import Gaps, MeshOutline, Outline, OutlinePoints, gaps, static_offset
 from .rig import (
@@ -314,6 +314,8 @@ class Fitter:
         """
         texture, motion = last or (None, None)
         levels, keep_shape = (levels, keep_shape) if last is None else ([LAST], True)
+        if motion is not None:
+            state = state._replace(poses=continuous(state.poses))
         vertices = self.vertices
         rig = PointRig.at_vertices(self.head, vertices)
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))

@@ -27,7 +27,7 @@ from ..ga.writer import save_npz
 from ..head.geometry import fit_sphere
 from ..head.model import PosedSubject
 from ..open import open_clip
-from .equations import HeadState, continuous, motion_spread
+from .equations import HeadState, motion_spread
 from .fit import Fitter, sampled_vertices, with_offset
 from .landmarks import ImageLandmarks, landmark_source
 from .outline import outline_of
@@ -406,7 +406,7 @@ def _fit_block(
     head = clip.head if offset is None else with_offset(clip.head, offset)
     fitter = Fitter(head, views, landmarks, sampled_vertices(clip.head), outlines)
     if last is not None and shape is not None and poses is not None:
-        state = HeadState(shape, continuous(poses))
+        state = HeadState(shape, poses)
         motion = motion_spread(part, last.seconds, state.poses.shape[1]) if last.seconds else None
         assert offset is not None
         fitted = fitter.fit_colours(state, stack, last=(last.texture, motion), progress=progress)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from headbench.bench.contracts import Camera
 from headbench.datasets.head.arrays import with_derived_regions
@@ -33,23 +34,44 @@ def resting(head):
     return HeadState(np.zeros(head.shape_basis.shape[2]), np.zeros((1, PoseColumns.of(head).size)))
 
 
+NOTHING = ImageLandmarks(
+    np.zeros((1, 3), int), np.array([[1.0, 0, 0]]), np.full((1, 1, 1, 2), np.nan), np.zeros((0, 2), int)
+)
+GREY = np.full((SIZE, SIZE, 3), 128, np.uint8)
+
+
 @pytest.mark.parametrize(("masked", "left_mm"), [(True, 1.0), (False, 5.0)])
 def test_an_outline_moves_the_head_where_colours_say_nothing(head, camera, masked, left_mm):
     mesh = np.asarray(head.template, np.float64)
     mask = np.where(rasterize_mesh(mesh, head.faces, camera).face >= 0, 255, 0).astype(np.uint8)
-    nothing = ImageLandmarks(
-        np.zeros((1, 3), int), np.array([[1.0, 0, 0]]), np.full((1, 1, 1, 2), np.nan), np.zeros((0, 2), int)
-    )
     outlines = [outline_of(mask) if masked else None]
-    fitter = Fitter(head, Views([camera]), nothing, sampled_vertices(head), outlines)
+    fitter = Fitter(head, Views([camera]), NOTHING, sampled_vertices(head), outlines)
     state = resting(head)
     aside = PoseColumns.of(head).translation.start
     state.poses[0, aside] = 0.005
-    grey = FrameStack([np.full((SIZE, SIZE, 3), 128, np.uint8)])
-    found = fitter.fit_colours(state, grey, levels=LEVELS[:1], keep_shape=True).state
+    found = fitter.fit_colours(state, FrameStack([GREY]), levels=LEVELS[:1], keep_shape=True).state
     rig = PointRig.at_vertices(head, np.asarray(head.regions["nose"]))
     moved = rig.points(found.shape, found.poses[0]) - mesh[head.regions["nose"]]
     assert abs(1e3 * moved[:, 0].mean()) == pytest.approx(left_mm, abs=1.0)
+
+
+@pytest.mark.parametrize("linked", [True, False])
+def test_the_last_pass_keeps_shape_and_half_turns(head, camera, linked):
+    vertices = sampled_vertices(head)
+    landmarks = NOTHING._replace(pixels=np.repeat(NOTHING.pixels, 2, axis=0))
+    filming = Camera("0", SIZE, SIZE, camera.K, np.eye(4))  # as of a video: the head is turned towards it
+    fitter = Fitter(head, Views([filming]), landmarks, vertices)
+    state = resting(head)
+    state.poses[0, PoseColumns.of(head).translation] = 0, 0, 1
+    poses = np.repeat(state.poses, 2, axis=0)
+    poses[:, 0] = np.pi - 0.01, -np.pi + 0.01  # nearly the same rotation
+    given = HeadState(state.shape + 0.5, poses)
+    motion = np.full((1, poses.shape[1]), 0.05) if linked else None
+    colours = np.zeros((len(vertices), 3))
+    found = fitter.fit_colours(given, FrameStack([GREY] * 2), last=(colours, motion)).state
+    np.testing.assert_array_equal(found.shape, given.shape)
+    turned = Rotation.from_rotvec(found.poses[:, :3]) * Rotation.from_rotvec(poses[:, :3]).inv()
+    assert turned.magnitude().max() < 0.05
 
 
 def test_pairs_of_landmarks_open_the_mouth(head, camera):
