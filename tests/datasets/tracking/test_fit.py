@@ -62,7 +62,7 @@ def test_the_last_pass_keeps_shape_and_half_turns(head, camera, linked):
     filming = Camera("0", SIZE, SIZE, camera.K, np.eye(4))  # as of a video: the head is turned towards it
     fitter = Fitter(head, Views([filming]), landmarks, vertices)
     state = resting(head)
-    state.poses[0, PoseColumns.of(head).translation] = 0, 0, 1
+    state.poses[0, PoseColumns.of(head).translation] = 0, 0.3, 1
     poses = np.repeat(state.poses, 2, axis=0)
     poses[:, 0] = np.pi - 0.01, -np.pi + 0.01  # nearly the same rotation
     given = HeadState(state.shape + 0.5, poses)
