@@ -46,6 +46,16 @@ LPIPS_VGG = replace(
     summary="Learned perceptual distance v0.1, VGG-16, inputs scaled to [-1, 1].",
 )
 
+LPIPS_SQUEEZE = replace(
+    LPIPS,
+    name="lpips-squeeze",
+    default=False,
+    label="LPIPS SqueezeNet",
+    implementation="headbench.metrics.lpips:lpips_squeeze",
+    needs="headbench.metrics.lpips:needs_squeeze",
+    summary="Learned perceptual distance v0.1, SqueezeNet, inputs scaled to [-1, 1].",
+)
+
 
 LPIPS_FACE = replace(
     LPIPS,
@@ -160,6 +170,7 @@ def _load(net: str, scaled: bool, device: str) -> Lpips | UnavailableError:
 
 lpips = SharedLpips()
 lpips_vgg = SharedLpips("vgg")
+lpips_squeeze = SharedLpips("squeeze")
 lpips_face = FaceLpips()
 lpips_unscaled = SharedLpips(scaled=False)
 lpips_vgg_unscaled = SharedLpips("vgg", scaled=False)
@@ -173,6 +184,11 @@ def needs_alex(config: Any, device: str) -> Iterator[Need]:
 def needs_vgg(config: Any, device: str) -> Iterator[Need]:
     """Weights of VGG-16 on this machine, without a download."""
     yield _weights("vgg")
+
+
+def needs_squeeze(config: Any, device: str) -> Iterator[Need]:
+    """Weights of SqueezeNet on this machine, without a download."""
+    yield _weights("squeeze")
 
 
 def _weights(net: str) -> Need:

@@ -13,7 +13,7 @@ from torch.nn import functional
 from headbench.bench.conformance.methods import picture
 from headbench.bench.errors import InputError, LeftOutError, UnavailableError
 from headbench.metrics import lpips_network as weights
-from headbench.metrics.lpips import lpips, lpips_face
+from headbench.metrics.lpips import lpips, lpips_face, lpips_squeeze
 from headbench.metrics.lpips_network import ALEX, NETWORKS, NO_WEIGHTS, SQUEEZE, VARIABLE, Lpips, read_weights
 
 
@@ -215,11 +215,37 @@ def test_an_odd_size_has_the_score_that_torchmetrics_documents(reference_folder)
     np.testing.assert_allclose(scores, [0.1024, 0.0938], atol=1.5e-4)
 
 
-def test_the_metric_of_the_registry_is_alexnet(reference_folder, bare_machine, monkeypatch):
-    monkeypatch.setenv(VARIABLE, str(reference_folder))
+def test_metrics_of_the_registry_name_their_networks(random_weights, bare_machine, monkeypatch):
+    monkeypatch.setenv(VARIABLE, str(random_weights))
     a, b = frames(2)
-    assert lpips(a, b) == Lpips("alex", weights=reference_folder)(a, b)
-    assert lpips(a, b) != Lpips("squeeze", weights=reference_folder)(a, b)
+    values = lpips(a, b), lpips_squeeze(a, b)
+    assert values == tuple(Lpips(net, weights=random_weights)(a, b) for net in ("alex", "squeeze"))
+    assert values[0] != values[1]
+
+
+def test_squeezenet_is_that_of_the_publication(random_weights):
+    """SqueezeNet 1.1 in functional calls, by the names of torchvision's parameters."""
+    state = torch.load(random_weights / SQUEEZE.features_file, weights_only=True)
+    image = torch.rand(1, 3, 47, 64)
+
+    def layer(x, name, **options):
+        weight, bias = state[f"features.{name}.weight"], state[f"features.{name}.bias"]
+        return functional.conv2d(x, weight, bias, **options).relu()
+
+    x = layer(image, "0", stride=2)
+    expected = [x]
+    for number in range(2, 13):
+        if number in (2, 5, 8):
+            x = functional.max_pool2d(x, 3, 2, ceil_mode=True)
+            continue
+        x = layer(x, f"{number}.squeeze")
+        x = torch.cat([layer(x, f"{number}.expand1x1"), layer(x, f"{number}.expand3x3", padding=1)], 1)
+        if number in (4, 7, 9, 10, 11, 12):
+            expected.append(x)
+    network = SQUEEZE.build()
+    network.load_state_dict(state)
+    for ours, theirs in zip(network(image), expected, strict=True):
+        torch.testing.assert_close(ours, theirs)
 
 
 @pytest.mark.parametrize("net", NETWORKS)
