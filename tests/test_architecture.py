@@ -202,7 +202,6 @@ READ_IN_ONE_PLACE = {
     r"\bcv2\.VideoCapture\(": {
         "bench/io/images.py",
         "datasets/nersemble/sequence.py",
-        "datasets/video/decode.py",
     },
     r"\bsafe_open\(|\bload_file\(": {"methods/shared/tensor_files.py"},
     r"\btorch\.load\(": {

@@ -1,4 +1,4 @@
-"""Scores a folder of images as if a method of a run had rendered them, after a check of their background."""
+"""Scores a folder of images as if a method of a run had rendered them, after a check of their background, or against another."""
 
 from __future__ import annotations
 
@@ -47,24 +47,38 @@ from ..protocol import Protocol, check_capture, make_protocols, needed
 from ..registry import discover, get, resolve
 from ..rows import Rows
 from ..specs import CommandResult, MethodSpec, MetricSpec, command
+from .folders import Resize, score_pairs
 from .frames import Render, check_truth, composited, named_renders
 
 
 @dataclass(frozen=True)
 class EvaluateSettings:
-    """Score a folder of images, made without a plug-in, or a stored avatar.
+    """Score images against others of the same names, or as renders of a capture's frames; or a stored avatar.
 
-    An image is SEQUENCE_TIMESTEP_CAMERA.png (timestep of five digits), as `headbench run` names its renders: 8-bit RGB PNG of
+    With --truth, images or videos in FOLDER are compared with those in another folder whose relative names without suffix are
+    the same, or one video with another; no capture is needed. Otherwise an image is SEQUENCE_TIMESTEP_CAMERA.png (timestep of five digits), as `headbench run` names its renders: 8-bit RGB PNG of
     the ground truth's size, composited on the capture's background. It lies in FOLDER itself, in a folder named after the task,
     or in renders/TASK; with several subjects, in a folder named after the subject. A cell of a run (SUBJECT/METHOD/seed-N) also
     has this layout. Give other names with --names.
     """
 
     folder: tyro.conf.Positional[str]
-    """Folder with the images, or with --avatar that of an avatar as `headbench render` takes it."""
+    """Folder with the images, or with --avatar that of an avatar as `headbench render` takes it; with --truth also a video."""
 
-    out: str
-    """Folder to write: a run with one method, which `table`, `compare`, `verify` and every report can read."""
+    out: str = ""
+    """Folder to write: a run with one method, which `table`, `compare`, `verify` and every report can read. With --truth, a CSV
+    file with a row for each pair of images; default: none."""
+
+    truth: str | None = None
+    """Folder of images or videos to compare with, or a video."""
+
+    masks: str | None = None
+    """With --truth: folder with a mask of the same name for each of its images or videos, white inside. Metrics that can be
+    limited to a region are computed in the mask, too; those of the face take it as the visible face."""
+
+    resize: Resize | None = None
+    """With --truth: resize renders of another size to that of the ground truth by means of areas or bicubically, antialiased;
+    default: they are refused."""
 
     clip: str | None = None
     """Capture to score against (or folder of several); default: that of the run named by --like."""
@@ -96,7 +110,7 @@ class EvaluateSettings:
     """Tasks to score. Not with --like, whose run decides it."""
 
     metrics: tuple[str, ...] = ()
-    """Metrics of frames to compute; default: those of `headbench run`. Not with --like."""
+    """Metrics of frames to compute; default: those of `headbench run`. Not with --like. With --truth also NAME@PROFILE."""
 
     protocol: tuple[str, ...] = ()
     """Published protocols, as for `headbench run`. Not with --like."""
@@ -119,12 +133,21 @@ class EvaluateSettings:
         DependentOptions(("trust",), "like"),
         DependentOptions(("method",), "avatar"),
         DependentOptions(("names", "any_background"), "avatar", False),
+        DependentOptions(("masks", "resize"), "truth"),
+        DependentOptions(
+            ("clip", "label", "avatar", "names", "any_background", "like", "tasks", "protocol", "reader")
+            + ("head", "frames_per_task"),
+            "truth",
+            False,
+        ),
     )
 
     def __post_init__(self) -> None:
         """Refuse settings without a reference for the evaluation."""
-        if self.clip is None and self.like is None:
-            raise ValueError("state the reference: --clip CAPTURE or --like RUN")
+        if self.truth is None and self.clip is None and self.like is None:
+            raise ValueError("state the reference: --clip CAPTURE, --like RUN or --truth FOLDER")
+        if self.truth is None and not self.out:
+            raise ValueError("state the folder to write: --out OUT")
 
 
 SAMPLE = 8
@@ -221,11 +244,16 @@ def images_method(label: str, version: str) -> ResolvedMethod:
 
 @command("evaluate", group="compare")
 def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress) -> CommandResult:
-    """Score a folder of images or a stored avatar, without a plug-in.
+    """Score images against others or a capture, or a stored avatar, without a plug-in.
 
     The text is the table, together with the run named by ``like``.
     """
     source = Path(settings.folder)
+    if settings.truth is not None:
+        masks = None if settings.masks is None else Path(settings.masks)
+        out = Path(settings.out) if settings.out else None
+        how = settings.metrics, settings.resize, out, settings.device
+        return score_pairs(source, Path(settings.truth), masks, *how, progress)
     stored = open_avatar(source, settings.method) if settings.avatar else None
     label = settings.label or ("images" if stored is None else stored.record["method"])
     config, clips = _open(settings, label, {} if stored is None else stored.heads)

@@ -214,12 +214,12 @@ def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> 
             pose_file = pose_files.get((key.subject, key.timestep), "")
             frames.append((task, *key, name, *_camera(by_subject[key.subject], key), pose_file))
             names.append((name, *key))
-    out, listing = Path(settings.out), _csv(names)
+    out, listing = Path(settings.out), csv_text(names)
     check_output_folder(out)
     if (out / MAP_FILE).exists() and (out / MAP_FILE).read_text(encoding="utf-8") != listing:
         expected = "no such file, or the template of the same frames"
         raise InputError(out / MAP_FILE, "", expected, "another list", "Move it, or choose another --out.")
-    write_text(out / FRAMES_FILE, _csv(frames))
+    write_text(out / FRAMES_FILE, csv_text(frames))
     write_text(out / MAP_FILE, listing)
     counts = {task: len(protocol.keys) for task, protocol in protocols.items()}
     hashes = {task: protocol.hash for task, protocol in protocols.items()}
@@ -275,7 +275,8 @@ def _pose_files(config: RunConfig, clips: Sequence[Clip]) -> dict[tuple[str, int
     }
 
 
-def _csv(lines: Iterable[Sequence[object]]) -> str:
+def csv_text(lines: Iterable[Sequence[object]]) -> str:
+    """Write lines as CSV."""
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows(lines)
     return stream.getvalue()

@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields, is_dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -120,12 +120,19 @@ class Score(NamedTuple):
     reason: str = ""
 
 
+class TruthImages(Protocol):
+    """Images of a `Clip`, or others; it may be a `RegionalClip`."""
+
+    def image(self, key: FrameKey) -> ByteArray:
+        """(H, W, 3) 8-bit sRGB."""
+
+
 class ScoredFrames(NamedTuple):
     """Source of the frames to score."""
 
     render: Callable[[FrameKey], ByteArray]
     """Reads a stored frame, (H, W, 3) 8-bit."""
-    clip: Clip
+    clip: TruthImages
     """Provides the ground truth, and the requested regions."""
 
 

@@ -32,6 +32,7 @@ from ...bench.io.files import check_kind, check_output_folder, check_writable, w
 from ...bench.io.images import ENCODINGS, browser_encoder, quantise, write_browser_video, write_png
 from ...bench.io.lock import locked
 from ...bench.io.provenance import RENDER
+from ...bench.io.videos import SUFFIXES
 from ...bench.specs import CommandResult, command
 from ..clip import CaptureClip, FrameFiles, without_images
 from ..ga.writer import CANONICAL_JAW, CapturePlan, CaptureWriter, SequencePlan
@@ -39,7 +40,6 @@ from ..head.arrays import JOINT_NAMES, HeadArrays, read_head
 from ..head.model import PosedSubject, pose_in_head_frame, resting
 from ..head.refit.identity import FACE
 from ..mesh_pictures import portrait_camera
-from ..video.decode import SUFFIXES
 from .formats import read_signal
 from .settings import DriveSettings
 from .signal import DrivingSignal, SignalRequest

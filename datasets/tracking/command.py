@@ -42,13 +42,13 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     Writes under ``settings.out`` the capture (images linked), ``track.json`` with every timestep's residuals and
     ``overlay.png``. Intermediate results are stored there, so that an interrupted call can be resumed.
     """
+    from ...bench.io.videos import is_video
     from ..clip import check_apart
     from ..ga.writer import capture_plan, write_capture
     from ..images import write_image
     from ..inspect.figure import draw_overlay
     from ..steps.masks import label_files, without_torso
     from ..video.command import video_to_track
-    from ..video.decode import is_video
     from .landmarks import landmark_source
     from .programs import track_with_program
     from .track import LandmarkSource, check_cameras, track, tracking_errors

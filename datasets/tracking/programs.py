@@ -20,13 +20,13 @@ from ...bench.contracts import Progress
 from ...bench.errors import InputError
 from ...bench.io.documents import read_json
 from ...bench.io.files import check_output_folder, digest, digest_file, write_json
+from ...bench.io.videos import is_video, probe_video
 from ...bench.process import described, environment, run_program
 from ...bench.specs import CommandResult, Need
 from ..ga.writer import link_or_copy
 from ..head.refit.command import target_head
 from ..monocular.clip import check_subject, subject_of
 from ..tracker_files.command import ImportTrackingSettings, import_tracking
-from ..video.decode import is_video, probe_video
 
 IMPORT_TIMEOUT_S = 300.0
 """Time limit for an interpreter to import the modules of a program, seconds."""

@@ -27,6 +27,7 @@ from ...bench.contracts import ByteArray, Camera, FloatArray, HeadPose, Progress
 from ...bench.errors import InputError
 from ...bench.io.files import digest, digest_file
 from ...bench.io.images import probe_image
+from ...bench.io.videos import TimedFrame, VideoInfo, probe_video, video_frames
 from ...bench.landmark_network import face_size, fetched_network, open_network
 from ...bench.protocol import evenly_with_ends
 from ..clip import CaptureClip
@@ -36,7 +37,6 @@ from ..head.model import resting
 from ..images import read_mask, write_image
 from ..monocular.clip import VIDEO, Track, VideoFrame, check_subject, clip_of_track, subject_of
 from ..tracking.settings import BACKGROUND, MASKLESS, TRACKER_VERSION, USUAL_FOCAL, VideoOptions
-from .decode import TimedFrame, VideoInfo, probe_video, video_frames
 from .faces import BELOW, Crop, FaceFinder, FoundFaces, crop_around, find_faces
 from .matting import refined_mask, without_room
 

@@ -24,6 +24,7 @@ from ...bench.contracts import BoolArray, ByteArray, FloatArray, IntArray, Progr
 from ...bench.errors import InputError
 from ...bench.io.arrays import Member, store_arrays, stored_arrays
 from ...bench.io.files import digest, digest_file
+from ...bench.io.videos import TimedFrame
 from ...bench.landmark_network import (
     COUNT,
     CROP,
@@ -37,7 +38,6 @@ from ...bench.landmark_network import (
     open_network,
     same_face,
 )
-from .decode import TimedFrame
 
 SIDE, STRIDE = 192, 4
 """Pixels of the square that the network sees, and of one cell of its grid."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError, UnavailableError
+from headbench.bench.io.videos import TimedFrame
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.mesh_pictures import draw_mesh, rasterize_mesh
 from headbench.datasets.tracking.settings import VideoOptions
@@ -19,7 +20,6 @@ from headbench.datasets.video.clip import (
     check_background,
     learn_background,
 )
-from headbench.datasets.video.decode import TimedFrame
 from headbench.datasets.video.faces import Crop, FoundFaces
 from headbench.datasets.video.matting import refined_mask
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from headbench.bench.io.videos import TimedFrame
 from headbench.bench.landmark_network import COUNT, CROP, FaceCrop, face_size, same_face
 from headbench.datasets.video import faces
-from headbench.datasets.video.decode import TimedFrame
 from headbench.datasets.video.faces import ANCHORS, SIDE, FaceDetector, FaceFinder, find_faces
 
 SHAPE = np.random.default_rng(0).uniform(-0.5, 0.5, (COUNT, 2))

@@ -13,6 +13,7 @@ import pytest
 
 from headbench.bench.contracts import Camera
 from headbench.bench.errors import InputError
+from headbench.bench.io.videos import video_frames
 from headbench.bench.landmark_network import COUNT
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.ga.writer import CaptureWriter
@@ -27,7 +28,6 @@ from headbench.datasets.tracking.landmarks import ImageLandmarks, spread_vertice
 from headbench.datasets.tracking.settings import WORK, TrackSettings
 from headbench.datasets.video import clip as video_clip
 from headbench.datasets.video import command, faces
-from headbench.datasets.video.decode import video_frames
 from headbench.datasets.video.faces import Crop, FoundFaces, crop_around
 
 from ..tiny_capture import look_at, make_plan, posed_vertices

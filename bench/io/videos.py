@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from ...bench.contracts import ByteArray
-from ...bench.errors import InputError, UnavailableError, install_extra
+from ..contracts import ByteArray
+from ..errors import InputError, UnavailableError, install_extra
 
 LEAST_SHARE = 0.9
 """Minimum fraction of the stated duration that must be decoded."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.datasets.video.decode import probe_video, video_frames
+from headbench.bench.io.videos import probe_video, video_frames
 
 
 def picture(index, width=64, height=48):

@@ -1,0 +1,181 @@
+"""Two folders of images or videos: pairs by name, values of the metrics, and errors that name the file."""
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from headbench.bench import cli
+from headbench.bench.audit.folders import _Video
+from headbench.bench.io.images import read_png, write_browser_video, write_png
+from headbench.bench.io.videos import video_frames
+from headbench.metrics.psnr import psnr
+
+RNG = np.random.default_rng(0)
+NAMES = ("a/2", "a/10", "b/1")
+INSIDE = np.zeros((24, 32), np.uint8)
+INSIDE[4:20, 6:22] = 255
+
+
+def picture(height=24, width=32):
+    return RNG.integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def folders(tmp_path, monkeypatch):
+    """Renders, ground truth and masks of three images in two folders, and a working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "conformance")
+    monkeypatch.syspath_prepend(Path(__file__).parents[1])
+    for name in NAMES:
+        write_png(tmp_path / f"renders/{name}.png", picture())
+        write_png(tmp_path / f"truth/{name}.png", picture())
+        mask = tmp_path / f"masks/{name}.png"
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(INSIDE).save(mask)
+    return tmp_path
+
+
+def evaluated(capsys, *words):
+    """Result of the command with ``--json``, and the rows of its CSV file."""
+    assert cli.main(["evaluate", *words, "--out", "out.csv", "--json"]) == 0
+    with open("out.csv", newline="") as stream:
+        return json.loads(capsys.readouterr().out), list(csv.DictReader(stream))
+
+
+def test_pairs_have_the_values_of_the_metrics(folders, capsys):
+    metrics = "psnr,outside_metric:JUMP,outside_metric:FACE,toy_plugin:NOT_HERE"
+    data, rows = evaluated(capsys, "renders", "--truth", "truth", "--masks", "masks", "--metrics", metrics)
+    pairs = [
+        [read_png(folders / folder / f"{name}.png") for folder in ("renders", "truth")] for name in NAMES
+    ]
+    expected = [psnr(*pair) for pair in pairs]
+    assert [row["name"] for row in rows] == list(NAMES)
+    assert [float(row["psnr"]) for row in rows] == expected
+    inside = INSIDE > 0
+    assert [float(row["psnr/mask"]) for row in rows] == [psnr(*(x[inside][None] for x in p)) for p in pairs]
+    faces = [np.abs(np.subtract(*(x[inside].astype(int) for x in p))).mean() for p in pairs]
+    assert [float(row["face"]) for row in rows] == faces
+    assert rows[0]["jump"] == rows[1]["jump"] != rows[2]["jump"] == ""  # neighbours in the folder alone
+    assert rows[0]["not_here"] == ""
+    assert "not" in rows[0]["missing"]
+    assert data["mean_of_pairs"]["psnr"] == pytest.approx(np.mean(expected))
+    assert data["mean_of_sequences"]["psnr"] == pytest.approx((np.mean(expected[:2]) + expected[2]) / 2)
+    assert data["mean_of_pairs"]["not_here"] is None
+
+
+def test_the_table_has_means_and_says_what_is_missing(folders, capsys):
+    for name in NAMES:
+        Path(f"renders/{name}.png").rename(f"renders/{name}.jpg")
+        Path(f"renders/{name}.jpg").write_bytes(cv2.imencode(".jpg", picture())[1].tobytes())
+    words = ["renders", "--truth", "truth", "--metrics", "l1,ssim@skimage,toy_plugin:NOT_HERE"]
+    assert cli.main(["evaluate", *words]) == 0
+    text = capsys.readouterr().out
+    for part in ("L1 ↓", "SSIM (skimage) ↑", "mean of sequences", "mean of pairs", "(Absent, 3 of 3 pairs)"):
+        assert part in text
+    assert "3 renders as JPEG or video" in text
+
+
+@pytest.mark.parametrize("method", ["area", "bicubic"])
+def test_renders_are_resized_to_the_truth(folders, capsys, method):
+    large = picture(48, 64)
+    write_png(Path("renders/b/1.png"), large)
+    _, rows = evaluated(capsys, "renders", "--truth", "truth", "--metrics", "l1", "--resize", method)
+    means = large.reshape(24, 2, 32, 2, 3).mean(axis=(1, 3))
+    expected = np.abs(means - read_png(Path("truth/b/1.png"))).mean() / 255
+    assert float(rows[2]["l1"]) == pytest.approx(expected, abs=1e-3 if method == "area" else 3e-2)
+    if method == "bicubic":
+        assert float(rows[2]["l1"]) != pytest.approx(expected, abs=1e-3)
+
+
+FAULTS = {
+    "a render without truth": (lambda: Path("truth/a/2.png").unlink(), "truth: .*each of the 3 in renders.*a/2"),
+    "a truth without render": (lambda: Path("renders/b/1.png").unlink(), "renders: .*the 3 in truth.*b/1"),
+    "no mask": (lambda: Path("masks/b/1.png").unlink(), "masks: .*b/1"),
+    "no images": (lambda: [p.unlink() for p in Path("truth").glob("*/*")], "truth: .*images or videos.*none"),
+    "no folder": (lambda: Path("truth").rename("other"), "truth: .*no such file or folder"),
+    "another size": (
+        lambda: write_png(Path("renders/a/2.png"), picture(48, 64)),
+        r"renders/a/2.png, size: .*32x24 pixels, as truth/a/2.png, found 64x48.*--resize",
+    ),
+    "another ratio": (lambda: write_png(Path("renders/a/2.png"), picture(24, 24)), "renders/a/2.png, size"),
+    "another size of a mask": (lambda: write_png(Path("masks/a/2.png"), picture(9, 9)), "masks/a/2.png, size"),
+    "a mask of 0 and 1": (
+        lambda: Image.fromarray(INSIDE // 255).save("masks/a/2.png"),
+        "masks/a/2.png: .*levels up to 1",
+    ),
+    "two of a name": (lambda: write_png(Path("renders/a/2.jpeg"), picture()), "2.*: expected one file of this name"),
+    "transparency": (
+        lambda: Image.fromarray(np.full((24, 32, 4), 90, np.uint8)).save("renders/a/2.png"),
+        "renders/a/2.png, alpha: .*transparent",
+    ),
+    "a damaged image": (lambda: Path("truth/a/10.png").write_bytes(b"no image"), "truth/a/10.png: .*PNG or JPEG"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_cannot_be_paired_is_refused_by_name(folders, capsys, fault):
+    spoil, message = FAULTS[fault]
+    spoil()
+    words = ["renders", "--truth", "truth", "--masks", "masks", "--metrics", "l1", "--out", "out.csv"]
+    resize = ["--resize", "area"] if fault == "another ratio" else []
+    assert cli.main(["evaluate", *words, *resize]) == 2
+    found = capsys.readouterr()
+    assert not found.out
+    assert re.search(message, " ".join(found.err.split()))
+    assert not Path("out.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("metric", "message"),
+    [
+        ("fps", "of kind avatar"),
+        ("lpips-face", "visible face. Give its pixels with --masks"),
+        ("psnt", "psnr"),
+    ],
+)
+def test_metrics_that_need_more_than_images_are_refused(folders, capsys, metric, message):
+    assert cli.main(["evaluate", "renders", "--truth", "truth", "--metrics", metric]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.fixture
+def videos(folders):
+    """Videos of twelve frames."""
+    for folder in ("renders", "truth"):
+        frames = [cv2.GaussianBlur(picture(), (0, 0), 3) for _ in range(12)]
+        write_browser_video(folders / folder / "clip.webm", frames, 25, "test")
+    return folders / "renders" / "clip.webm", folders / "truth" / "clip.webm"
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["files", "folders"])
+def test_videos_are_compared_frame_by_frame(videos, capsys, whole):
+    words = [str(path if whole else path.parent) for path in videos]
+    for folder in [] if whole else ("renders", "truth"):
+        for name in NAMES:
+            Path(folder, f"{name}.png").unlink()
+    _, rows = evaluated(capsys, words[0], "--truth", words[1], "--metrics", "psnr,outside_metric:JUMP")
+    frames = zip(*(video_frames(path) for path in videos))
+    assert [float(row["psnr"]) for row in rows] == [psnr(a.image, b.image) for a, b in frames]
+    assert [row["name"] for row in rows][::11] == ["clip/00000", "clip/00011"]
+    assert all(row["jump"] for row in rows)
+
+
+def test_videos_of_other_lengths_are_refused(videos, capsys):
+    write_browser_video(videos[1], [picture() for _ in range(11)], 25, "test")
+    assert cli.main(["evaluate", str(videos[0]), "--truth", str(videos[1])]) == 2
+    assert "clip.webm, frames: expected 32x24 pixels, 11 frames" in " ".join(capsys.readouterr().err.split())
+
+
+def test_frames_of_a_video_are_found_in_any_order(videos):
+    video = _Video(videos[0])
+    video._most = 3
+    expected = [frame.image for frame in video_frames(videos[0])]
+    for number in (0, 2, 1, 11, 3, 4, 0):
+        np.testing.assert_array_equal(video.frame(number), expected[number])
+    assert len(video._kept) <= 3
