@@ -16,7 +16,7 @@ Conventions
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
@@ -480,6 +480,13 @@ class SequenceMetric(Protocol):
 
     def __call__(self, images: Sequence[ByteArray], targets: Sequence[ByteArray]) -> float:
         """Compare images with the ground truth; (H, W, 3) 8-bit each, one per scored frame."""
+
+
+class SetMetric(Protocol):
+    """One number for all frames of a subject and task, in any order (`MetricSpec.kind` "set")."""
+
+    def __call__(self, pairs: Iterable[tuple[ByteArray, ByteArray]]) -> float:
+        """Compare images with the ground truth; pairs of (H, W, 3) 8-bit each, read lazily."""
 
 
 class Measurement(NamedTuple):

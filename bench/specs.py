@@ -176,7 +176,9 @@ MAX_DIGITS = 12
 """Decimals shown in tables."""
 
 
-MetricKind = Literal["frame", "regional", "face", "temporal", "sequence", "avatar", "mechanism", "training"]
+MetricKind = Literal[
+    "frame", "regional", "face", "temporal", "sequence", "set", "avatar", "mechanism", "training"
+]
 
 
 @dataclass(frozen=True)
@@ -193,7 +195,7 @@ class MetricSpec:
     summary: str = ""
     kind: MetricKind = "frame"
     """"frame", a `Metric`; "regional", a `RegionalMetric`; "face", a `VisibleFaceMetric`; "temporal", a `TemporalMetric`;
-    "sequence", a `SequenceMetric`, whose value is assigned to each of the frames; "avatar", an `AvatarMetric`;
+    "sequence", a `SequenceMetric`, whose value is assigned to each of the frames; "set", a `SetMetric`, likewise; "avatar", an `AvatarMetric`;
     "mechanism", one whose workload is the poses of training; "training", a `TrainingMetric`."""
     detail: str = ""
     """Key of the measurement's details that holds the value, in ``unit``; "" for the main value. Metrics of an avatar
@@ -217,7 +219,7 @@ class MetricSpec:
     @property
     def per_frame(self) -> bool:
         """Whether every frame has a value; otherwise the avatar has one."""
-        return self.kind in ("frame", "regional", "face", "temporal", "sequence")
+        return self.kind in ("frame", "regional", "face", "temporal", "sequence", "set")
 
     @property
     def is_speed(self) -> bool:

@@ -267,6 +267,10 @@ class _Column:
         scores = (self.scores.get(pair.key) for pair in pairs)
         return [score.value for score in scores if score is not None and score.status == "ok"]
 
+    def mean(self, pairs: Sequence[Pair], *, whole: bool) -> float | None:
+        """Mean of a sequence; a metric of all frames together has none, unless it is the ``whole``."""
+        return None if self.spec.kind == "set" and not whole else _mean(self.values(pairs))
+
     def shown(self, value: float | None) -> str:
         return "–" if value is None else f"{value:.{self.spec.digits}f}"
 
@@ -308,8 +312,11 @@ def score_pairs(
     if out is not None:
         write_text(out, _csv(pairs, columns))
     sequences = {name: list(of) for name, of in groupby(pairs, key=lambda pair: pair.key.sequence)}
-    means = {name: [_mean(column.values(of)) for column in columns] for name, of in sequences.items()}
     over_pairs = [_mean(column.values(pairs)) for column in columns]
+    means = {
+        name: [column.mean(of, whole=len(sequences) == 1) for column in columns]
+        for name, of in sequences.items()
+    }
     over_sequences = [_mean([mean for mean in of if mean is not None]) for of in zip(*means.values())]
     rows = [(name or renders.name, len(sequences[name]), values) for name, values in means.items()]
     if len(rows) > 1:

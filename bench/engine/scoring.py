@@ -135,6 +135,10 @@ class ScoredFrames(NamedTuple):
     clip: TruthImages
     """Provides the ground truth, and the requested regions."""
 
+    def pair(self, key: FrameKey) -> tuple[ByteArray, ByteArray]:
+        """A stored frame and its ground truth."""
+        return self.render(key), self.clip.image(key)
+
 
 def make_metric(spec: MetricSpec, device: str = "cpu") -> Any:
     """Import the object that a spec names; a class is instantiated without arguments.
@@ -240,11 +244,8 @@ def _batched(
 ) -> Iterator[Score]:
     """Scores of a metric that processes many frames in one pass, in order."""
 
-    def pair(key: FrameKey) -> tuple[ByteArray, ByteArray]:
-        return frames.render(key), frames.clip.image(key)
-
     try:
-        values = metric.batched(_ahead(pool, pair, keys))
+        values = metric.batched(_ahead(pool, frames.pair, keys))
         for key, value in zip(keys, values, strict=True):
             yield Score(spec.name, key, FULL, float(value))
     except UnavailableError as error:
@@ -321,19 +322,32 @@ def _sequences(
         yield _missing(spec, key, value) if isinstance(value, str) else Score(spec.name, key, FULL, value)
 
 
-STREAMS = {"face": _faces, "temporal": _temporal, "sequence": _sequences}
+def _set(
+    keys: Sequence[FrameKey], frames: ScoredFrames, spec: MetricSpec, metric: Any, pool: ThreadPoolExecutor
+) -> Iterator[Score]:
+    """Scores of a metric of all frames together; each frame gets its value."""
+    try:
+        value = float(metric(_ahead(pool, frames.pair, keys)))
+        yield from (Score(spec.name, key, FULL, value) for key in keys)
+    except UnavailableError as error:
+        yield from (_missing(spec, key, error.note) for key in keys)
+
+
+STREAMS = {"face": _faces, "temporal": _temporal, "sequence": _sequences, "set": _set}
 """Scoring functions of metrics that need more than an image and its ground truth, by kind."""
 
 
 def compared_over_time(metric: Any, kind: str) -> Callable[[ByteArray, ByteArray], float]:
-    """Wrap a frame metric of any kind for single images, with an error-free neighbour, a static sequence or a face that fills
-    the frame."""
+    """Wrap a frame metric of any kind for single images, with an error-free neighbour, a static sequence, a face that fills
+    the frame, or a set with the mirrored images."""
     if kind == "face":
         return lambda image, truth: metric(image, truth, np.ones(truth.shape[:2], np.bool_))
     if kind == "temporal":
         return lambda image, truth: metric(image, truth, np.roll(truth, 1, axis=1), np.roll(truth, 1, axis=1))
     if kind == "sequence":
         return lambda image, truth: metric([image], [truth])
+    if kind == "set":
+        return lambda image, truth: metric([(image, truth), (image[:, ::-1], truth[:, ::-1])])
     return metric  # type: ignore[no-any-return]
 
 

@@ -594,6 +594,7 @@ KINDS = {
     "face": "measured for each frame in which the face is visible",
     "temporal": "measured for each frame and its predecessor",
     "sequence": "measured for all frames of a sequence at a camera together",
+    "set": "measured for all frames of a subject and task together",
     "mechanism": "measured for each avatar over the poses of its training",
 }
 

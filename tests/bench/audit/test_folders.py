@@ -49,7 +49,7 @@ def evaluated(capsys, *words):
 
 
 def test_pairs_have_the_values_of_the_metrics(folders, capsys):
-    metrics = "psnr,outside_metric:JUMP,outside_metric:FACE,toy_plugin:NOT_HERE"
+    metrics = "psnr,outside_metric:JUMP,outside_metric:FACE,outside_metric:WORST,toy_plugin:NOT_HERE"
     data, rows = evaluated(capsys, "renders", "--truth", "truth", "--masks", "masks", "--metrics", metrics)
     pairs = [
         [read_png(folders / folder / f"{name}.png") for folder in ("renders", "truth")] for name in NAMES
@@ -62,6 +62,10 @@ def test_pairs_have_the_values_of_the_metrics(folders, capsys):
     faces = [np.abs(np.subtract(*(x[inside].astype(int) for x in p))).mean() for p in pairs]
     assert [float(row["face"]) for row in rows] == faces
     assert rows[0]["jump"] == rows[1]["jump"] != rows[2]["jump"] == ""  # neighbours in the folder alone
+    worst = max(np.abs(np.subtract(*(x.astype(int) for x in pair))).mean() for pair in pairs)
+    assert {float(row["worst"]) for row in rows} == {worst}
+    assert data["mean_of_pairs"]["worst"] == pytest.approx(worst)
+    assert data["mean_of_sequences"]["worst"] is None  # of all pairs together
     assert rows[0]["not_here"] == ""
     assert "not" in rows[0]["missing"]
     assert data["mean_of_pairs"]["psnr"] == pytest.approx(np.mean(expected))

@@ -51,9 +51,14 @@ def face_error(image, truth, face):
     return MeanError().in_regions(image, truth, {"face": face})["face"]
 
 
+def worst(pairs):
+    return max(float(difference(image, truth).mean()) for image, truth in pairs)
+
+
 ERROR = MetricSpec("mae", "MAE", "levels", False, 2, "outside_metric:MeanError", kind="regional")
 JUMP = MetricSpec("jump", "Jump", "levels", False, 2, "outside_metric:jump", kind="temporal")
 FACE = MetricSpec("face", "Face", "levels", False, 2, "outside_metric:face_error", kind="face")
+WORST = MetricSpec("worst", "Worst", "levels", False, 2, "outside_metric:worst", kind="set")
 FILES = MetricSpec(
     "files", "Files", "", False, 0, "outside_metric:file_count", kind="avatar", detail="frames"
 )

@@ -178,7 +178,7 @@ def test_our_own_reader_conforms():
 
 
 PLUGINS = ("camera_mean:SPEC", "outside_reader:SPEC", "mae:MAE") + tuple(
-    f"outside_metric:{name}" for name in ("ERROR", "JUMP", "FACE", "FILES", "HOURS")
+    f"outside_metric:{name}" for name in ("ERROR", "JUMP", "FACE", "WORST", "FILES", "HOURS")
 )
 
 

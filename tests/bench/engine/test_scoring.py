@@ -123,6 +123,11 @@ def video(images, truths):
     return len(images)
 
 
+def largest(pairs):
+    """Of the ground truth of all frames."""
+    return max(int(truth.max()) for _, truth in pairs)
+
+
 def change(image, truth, other_image, other_truth):
     return float(image.astype(float).mean() - other_image.astype(float).mean())
 
@@ -233,6 +238,12 @@ def test_all_frames_of_a_sequence_have_the_value_of_their_video(spec):
     assert [s.key for s in scored] == KEYS
 
 
+def test_all_frames_have_the_value_of_their_set(spec):
+    scored = score_frames(KEYS, FRAMES, [spec("l", "largest", kind="set")])["l"]
+    assert {s.value for s in scored} == {max(float(FRAMES.clip.image(key).max()) for key in KEYS)}
+    assert [s.key for s in scored] == KEYS
+
+
 @pytest.mark.parametrize(
     ("implementation", "fields", "reason"),
     [
@@ -242,6 +253,7 @@ def test_all_frames_of_a_sequence_have_the_value_of_their_video(spec):
         ("noted", {"kind": "face"}, "Weights missing."),
         ("noted", {"kind": "temporal"}, "Weights missing."),
         ("noted", {"kind": "sequence"}, "Weights missing."),
+        ("noted", {"kind": "set"}, "Weights missing."),
         ("NotedBatches", {}, "Weights missing."),
     ],
 )
