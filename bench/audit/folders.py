@@ -227,7 +227,8 @@ class PairedImages:
 def pair_metrics(names: Sequence[str], *, masks: bool) -> list[MetricSpec]:
     """Metrics by name, also ``NAME@PROFILE``; by default those of frames that a run measures."""
     specs: list[MetricSpec] = []
-    for name in names or [name for name in default_names("metrics") if get("metrics", name).per_frame]:
+    default = [name for name in default_names("metrics") if get("metrics", name).per_frame]
+    for name in dict.fromkeys(names or default):
         profile = name.partition("@")[2]
         of_profile = [m for m in get("profiles", profile).metrics if m.name == name] if profile else []
         spec = of_profile[0] if of_profile else get("metrics", name)
@@ -309,39 +310,41 @@ def score_pairs(
         for spec in specs
         for region in (FULL, *(regions if spec.kind == "regional" else ()))
     ]
-    if out is not None:
-        write_text(out, _csv(pairs, columns))
-    sequences = {name: list(of) for name, of in groupby(pairs, key=lambda pair: pair.key.sequence)}
-    over_pairs = [_mean(column.values(pairs)) for column in columns]
-    means = {
-        name: [column.mean(of, whole=len(sequences) == 1) for column in columns]
-        for name, of in sequences.items()
-    }
-    over_sequences = [_mean([mean for mean in of if mean is not None]) for of in zip(*means.values())]
-    rows = [(name or renders.name, len(sequences[name]), values) for name, values in means.items()]
-    if len(rows) > 1:
-        rows = rows if len(rows) <= MOST_ROWS else []
-        rows.append(("mean of sequences", len(pairs), over_sequences))
-        rows.append(("mean of pairs", len(pairs), over_pairs))
-    lines = [[name, str(n), *(c.shown(v) for c, v in zip(columns, values))] for name, n, values in rows]
-    notes = [f"{renders} against {truth}: {counted(len(pairs), 'pair')}, {counted(len(means), 'sequence')}."]
+    notes = []
     if resize is not None:
         notes.append(f"Renders of another size are resized to that of the ground truth ({resize}).")
     if lossy := sum(pair.render.suffix.lower() != ".png" for pair in pairs):
         notes.append(f"The compression of {counted(lossy, 'render')} as JPEG or video is scored, too.")
     notes += [sentence for column in columns for sentence in column.missing(pairs)]
-    notes += [str(out)] if out is not None else []
-    shown = table(["Sequence", "Pairs", *(column.head for column in columns)], lines)
+    if out is not None:
+        write_text(out, _csv(pairs, columns))
+        notes.append(str(out))
+    text, means = _means(pairs, columns, renders.name)
+    about = f"{renders} against {truth}: {counted(len(pairs), 'pair')}."
+    data = {"pairs": len(pairs), **means, "resize": resize, "out": out}
+    return CommandResult("\n\n".join([text, "\n".join([about, *notes])]), data)
+
+
+def _means(pairs: Sequence[Pair], columns: Sequence[_Column], title: str) -> tuple[str, dict[str, object]]:
+    """Means of every sequence, of sequences and of pairs, as a table and by name; ``title`` is for pairs without a folder."""
+    sequences = {name: list(of) for name, of in groupby(pairs, key=lambda pair: pair.key.sequence)}
+    single = len(sequences) == 1
+    means = {name: [column.mean(of, whole=single) for column in columns] for name, of in sequences.items()}
+    over_sequences = [_mean([mean for mean in of if mean is not None]) for of in zip(*means.values())]
+    over_pairs = [_mean(column.values(pairs)) for column in columns]
+    rows = [(name or title, len(sequences[name]), values) for name, values in means.items()]
+    if not single:
+        rows = rows if len(rows) <= MOST_ROWS else []
+        rows.append((f"mean of {len(means)} sequences", len(pairs), over_sequences))
+        rows.append(("mean of pairs", len(pairs), over_pairs))
+    lines = [[name, str(n), *(c.shown(v) for c, v in zip(columns, values))] for name, n, values in rows]
     names = [column.name for column in columns]
     data = {
-        "pairs": len(pairs),
         "mean_of_pairs": dict(zip(names, over_pairs)),
         "mean_of_sequences": dict(zip(names, over_sequences)),
         "sequences": {name: dict(zip(names, values)) for name, values in means.items()},
-        "resize": resize,
-        "out": out,
     }
-    return CommandResult("\n\n".join([shown, "\n".join(notes)]), data)
+    return table(["Sequence", "Pairs", *(column.head for column in columns)], lines), data
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -80,7 +80,13 @@ def test_the_table_has_means_and_says_what_is_missing(folders, capsys):
     words = ["renders", "--truth", "truth", "--metrics", "l1,ssim@skimage,toy_plugin:NOT_HERE"]
     assert cli.main(["evaluate", *words]) == 0
     text = capsys.readouterr().out
-    for part in ("L1 ↓", "SSIM (skimage) ↑", "mean of sequences", "mean of pairs", "(Absent, 3 of 3 pairs)"):
+    for part in (
+        "L1 ↓",
+        "SSIM (skimage) ↑",
+        "mean of 2 sequences",
+        "mean of pairs",
+        "(Absent, 3 of 3 pairs)",
+    ):
         assert part in text
     assert "3 renders as JPEG or video" in text
 
