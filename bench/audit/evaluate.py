@@ -66,8 +66,8 @@ class EvaluateSettings:
     """Folder with the images, or with --avatar that of an avatar as `headbench render` takes it; with --truth also a video."""
 
     out: str = ""
-    """Folder to write: a run with one method, which `table`, `compare`, `verify` and every report can read. With --truth, a file
-    to write as CSV, a row for each pair of images; default: none."""
+    """Folder to write: a run with one method, which `table`, `compare`, `verify` and every report can read; with --truth, a
+    file to write as CSV with a row for each pair, by default none."""
 
     truth: str | None = None
     """Folder of images or videos to compare with, or a video."""
