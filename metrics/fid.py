@@ -24,7 +24,7 @@ from .inception import Inception
 from .psnr import check_pair
 
 VARIABLE = "HEADBENCH_INCEPTION"
-BATCH = 8
+BATCH = 4
 """Number of pairs that the network is given at a time."""
 REMEDY = (
     f"Set {VARIABLE} to the file pt_inception-2015-12-05-6726825d.pth, which the project pytorch-fid (mseitzer on GitHub) publishes "
@@ -57,23 +57,29 @@ class Fid:
             features.append(network([image for pair in batch for image in pair]))
         if sum(map(len, features)) < 4:
             raise UnavailableError("FID needs at least two frames.", "Score more frames.")
-        joined = np.concatenate(features).astype(float)
+        joined = np.concatenate(features)
+        features.clear()
         return frechet_distance(joined[::2], joined[1::2])
 
 
 def frechet_distance(first: FloatArray, second: FloatArray) -> float:
     """Squared Fréchet distance of the normal distributions with the means and covariances of two (N, D) samples."""
-    apart = np.square(first.mean(axis=0) - second.mean(axis=0)).sum()
-    a, b = _root(first), _root(second)
+    means = [sample.mean(axis=0, dtype=np.float64) for sample in (first, second)]
+    apart = np.square(means[0] - means[1]).sum()
+    a, b = (_root(sample, mean) for sample, mean in zip((first, second), means))
     # The trace of (A^T A B^T B)^(1/2) is the sum of the singular values of A B^T.
     spread = np.square(a).sum() + np.square(b).sum() - 2 * np.linalg.norm(a @ b.T, "nuc")
     return max(0.0, float(apart + spread))
 
 
-def _root(sample: FloatArray) -> FloatArray:
-    """A matrix R of at most D rows, where R^T R is the covariance of an (N, D) sample."""
-    centred = sample - sample.mean(axis=0)
-    return np.asarray(np.linalg.qr(centred, mode="r")) / math.sqrt(len(sample) - 1)
+def _root(sample: FloatArray, mean: FloatArray) -> FloatArray:
+    """A matrix R of at most D rows, where R^T R is the covariance of an (N, D) sample; D rows at a time, to save memory."""
+    size = sample.shape[1]
+    root = np.empty((0, size))
+    for start in range(0, len(sample), size):
+        part = sample[start : start + size] - mean
+        root = np.asarray(np.linalg.qr(np.concatenate([root, part]), mode="r"))
+    return root / math.sqrt(len(sample) - 1)
 
 
 @functools.cache
