@@ -363,7 +363,8 @@ CASES = {
         case("doctor gha --device cpu", "The methods named can run here"),
     ],
     "run parity": [],  # in tests/methods/official, with a stand-in for the authors' repository
-    "submission render": [],  # these three in tests/datasets/nersemble, with a benchmark's folder
+    "prepare benchmark": [],  # these four in tests/datasets/nersemble, with a benchmark's folder
+    "submission render": [],
     "submission write": [],
     "submission check": [],
     "doctor check": [

@@ -16,6 +16,7 @@ from ..head.arrays import HeadArrays
 from ..head.loaders import OPEN, load_head
 from ..head.procedural.versions import VERSIONS
 from .names import (
+    NOVEL_VIEW_CAMERA,
     PAPER_SEQUENCES,
     SEQUENCES,
     TEST_SEQUENCE,
@@ -52,6 +53,8 @@ class SequenceJob:
     tracked: TrackedSequence | None
     """Parameters, or None if there are none yet."""
     folder: Path
+    on_white: bool = False
+    """Whether the frames are finished: on white, with corrected colours."""
 
     @property
     def count(self) -> int:
@@ -76,7 +79,10 @@ class SequenceJob:
         corrections = {serial: repr(vars(c)["matrix"].tolist()) for serial, c in self.corrections.items()}
         stills = {serial: path.stat().st_size for serial, path in self.stills.items()}
         cameras = [[c.id, c.width, c.height, c.K.tolist(), c.world_to_camera.tolist()] for c in self.cameras]
-        return digest(IMAGES_VERSION, views, corrections, stills, cameras, list(self.recorded.numbers))
+        finished = ["on white"] if self.on_white else []
+        return digest(
+            IMAGES_VERSION, views, corrections, stills, cameras, list(self.recorded.numbers), *finished
+        )
 
     def metadata_fingerprint(self, declaration: layout.Declaration) -> str:
         """Digest of the inputs of the metadata beside the images: parameters and declaration."""
@@ -95,6 +101,8 @@ class PreparationPlan:
     head: HeadArrays | None
     head_model: str
     union: Path
+    novel_views: Sequence[str] = (NOVEL_VIEW_CAMERA,)
+    """Cameras held out for novel views."""
 
     def declaration(self, jobs: Sequence[SequenceJob], head_file: str) -> layout.Declaration:
         """``headbench.json`` for a folder with these sequences."""

@@ -32,7 +32,6 @@ from ..ga import layout
 from ..ga.writer import camera_record, file_record, save_npz, transforms_document, write_sequence, write_union
 from ..head.arrays import save_head
 from ..images import is_whole, read_mask, write_image
-from .names import NOVEL_VIEW_CAMERA
 from .plan import CY, PreparationPlan, SequenceJob
 from .recording import prepare_pixels, read_still
 from .sequence import RecordedView, open_video
@@ -139,6 +138,8 @@ def _run(stream: _Stream, reports: queue.SimpleQueue, stop: threading.Event) -> 
     numbers = [job.recorded.numbers[timestep] for timestep in stream.timesteps]
     view = job.recorded.views[camera.id]
     still = read_still(job.stills[camera.id], view.size) if camera.id in job.stills else None
+    if job.on_white:
+        still = np.full((*view.size[::-1], 3), 255, np.uint8)
     frames = read_frames(view, numbers)
     for timestep, frame in zip(stream.timesteps, frames):
         if stop.is_set():
@@ -338,7 +339,7 @@ def _write_metadata(plan: PreparationPlan, job: SequenceJob, state: SequenceStat
     bare = [{k: v for k, v in f.items() if k != "flame_param_path"} for f in _frames(job, np.zeros(3))]
     write_json(job.folder / BACKUP_FILE, transforms_document(bare, _intrinsics(job.cameras[-1])))
     if job.tracked is not None:
-        _write_tracked(job, job.tracked, declaration)
+        _write_tracked(plan, job, job.tracked, declaration)
     _write_state(job, replace(state, images_complete=True, metadata=fingerprint))
 
 
@@ -368,14 +369,16 @@ def _moved(camera: Camera, shift: FloatArray) -> Camera:
     return replace(camera, world_to_camera=matrix)
 
 
-def _write_tracked(job: SequenceJob, tracked: TrackedSequence, declaration: layout.Declaration) -> None:
+def _write_tracked(
+    plan: PreparationPlan, job: SequenceJob, tracked: TrackedSequence, declaration: layout.Declaration
+) -> None:
     """Write parameters and JSONs in the world whose mean translation is zero."""
     for timestep in range(tracked.count):
         path = job.folder / layout.TRACKING_FOLDER / layout.parameter_name(timestep)
         save_npz(path, tracked.parameters(timestep))
     save_npz(job.folder / layout.CANONICAL_FILE, tracked.canonical())
     frames = _frames(job, tracked.shift)
-    write_sequence(job.folder, frames, _intrinsics(job.cameras[-1]), (NOVEL_VIEW_CAMERA,), declaration)
+    write_sequence(job.folder, frames, _intrinsics(job.cameras[-1]), plan.novel_views, declaration)
 
 
 def _is_readable(job: SequenceJob) -> bool:
@@ -403,7 +406,7 @@ def _write_union(plan: PreparationPlan) -> dict[str, int]:
     if own_head and plan.head is not None:  # FLAME's licence forbids copies; readers are given its file
         save_head(plan.union / layout.HEAD_FILE, plan.head)
     folders = [job.folder for job in train], [job.folder for job in test]
-    frames = write_union(plan.union, *folders, (NOVEL_VIEW_CAMERA,), declaration)
+    frames = write_union(plan.union, *folders, plan.novel_views, declaration)
     write_json(record, {"format_version": RECORD_VERSION, "metadata": fingerprint, "frames": frames})
     return frames
 
@@ -412,8 +415,8 @@ def _missing(plan: PreparationPlan) -> tuple[str, ...]:
     """Missing parts of the capture, one sentence each."""
     untracked = [job.recorded.name for job in plan.jobs if not _is_readable(job)]
     unmasked = [job.recorded.name for job in plan.jobs if not job.recorded.has_masks]
-    plain = [job.recorded.name for job in plan.jobs if not job.corrections]
-    held_out = {camera.id for job in plan.jobs for camera in job.cameras}
+    plain = [job.recorded.name for job in plan.jobs if not job.corrections and not job.on_white]
+    cameras = {camera.id for job in plan.jobs for camera in job.cameras}
     lines = []
     if untracked:
         lines.append(
@@ -430,6 +433,6 @@ def _missing(plan: PreparationPlan) -> tuple[str, ...]:
         lines.append(f"no colour correction for {', '.join(plain)}: colours are as recorded.")
     if not plan.test:
         lines.append("no held-out sequence among those prepared: nothing to test self-reenactment on.")
-    if NOVEL_VIEW_CAMERA not in held_out:
-        lines.append(f"no camera {NOVEL_VIEW_CAMERA}: nothing to test novel views on.")
+    for camera in set(plan.novel_views) - cameras:
+        lines.append(f"no camera {camera}: nothing to test novel views on.")
     return tuple(lines)

@@ -65,10 +65,15 @@ class BenchmarkSequence:
 
 
 def read_sequence(
-    data: Path, track: BenchmarkTrack, participant: str, sequence: str, head: HeadArrays
+    data: Path,
+    track: BenchmarkTrack,
+    participant: str,
+    sequence: str,
+    head: HeadArrays,
+    shape: FloatArray | None = None,
 ) -> BenchmarkSequence:
     """Read cameras and tracking of a sequence from the benchmark's folder. ``head``: FLAME 2023 with or without teeth;
-    coefficients are padded with zeros to its bases."""
+    coefficients are padded with zeros to its bases. ``shape``: (S,) shape that poses are for; default: that of the file."""
     path = tracking_file(data, participant, sequence)
     arrays = read_arrays(path, MEMBERS)
     for name, values in arrays.items():
@@ -81,7 +86,8 @@ def read_sequence(
     if off > EULER_TOLERANCE:
         expected = "the matrices of the angles in rotation (intrinsic X, Y, Z)"
         raise InputError(path, "rotation_matrices", expected, f"ones that differ by {off:.3g}")
-    shape = _padded(path, "shape", arrays["shape"], head.shape_basis.shape[2])[0]
+    if shape is None:
+        shape = _padded(path, "shape", arrays["shape"], head.shape_basis.shape[2])[0]
     expression = _padded(path, "expression", arrays["expression"], head.expression_basis.shape[2])
     neutral = head.template + head.shape_basis @ shape
     regressor = head.joint_regressor[0]

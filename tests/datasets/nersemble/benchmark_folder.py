@@ -7,9 +7,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from headbench.datasets.head.arrays import HeadArrays
-from headbench.datasets.nersemble.benchmark.submission import MONO, TRACKING_FILE
+from headbench.datasets.nersemble.benchmark.submission import MONO, TRACKING_FILE, TRACKS
+
+from .recordings import write_video
 
 SCALE = 4.0
+TRAINING = {"EMO-2-surprise+fear": 3, "EXP-1-head": 4}
+"""Training sequences and their numbers of frames."""
 
 
 def tracking(head: HeadArrays, frames: int, seed: int = 0) -> dict[str, np.ndarray]:
@@ -51,3 +55,28 @@ def write_benchmark(root: Path, head: HeadArrays) -> Path:
     document = {"world_2_cam": matrices, "intrinsics": dict.fromkeys(MONO.serials, K)}
     (home / "calibration" / "camera_params.json").write_text(json.dumps(document))
     return root
+
+
+def write_training(
+    root: Path, head: HeadArrays, serials: dict[str, list[str]]
+) -> dict[str, list[np.ndarray]]:
+    """Write videos of participant 393: of each track, those of ``serials``. The person is a square; returns its colours."""
+    colours = {}
+    for track, cameras in serials.items():
+        width, height = TRACKS[track].size
+        home = root / track / "393"
+        for number, (sequence, count) in enumerate(TRAINING.items()):
+            colours[sequence] = [np.array([60 + 30 * frame, 90, 160 - 50 * number]) for frame in range(count)]
+            mask = np.zeros((height, width), np.uint8)
+            mask[height // 4 : height // 2, width // 4 : width // 2] = 255
+            images = [
+                np.where(mask[..., None] > 0, colour, 255).astype(np.uint8) for colour in colours[sequence]
+            ]
+            folder = home / "sequences" / sequence
+            for serial in cameras:
+                write_video(folder / "images" / f"cam_{serial}.mp4", images, 24.3)
+                write_video(folder / "alpha_maps" / f"cam_{serial}.mp4", [mask] * count, 24.3)
+            if track == MONO.name:
+                (folder / "tracking").mkdir()
+                np.savez(folder / "tracking" / TRACKING_FILE, **tracking(head, count, 10 + number))
+    return colours
