@@ -208,18 +208,57 @@ class Influence(NamedTuple):
     weights: Tensor
 
 
+ROUNDING = 1e-5
+"""Canonical units, above the rounding errors of distances."""
+
+
+class NearestLandmarks:
+    """The landmarks of `influences` for points that move little from one call to the next, which are searched again only after
+    they have moved so far that the influences may be those of another landmark.
+
+    Another can be nearer after half the difference of the distances from the two nearest ones. Which one is nearest has no effect
+    while all are farther than ``far_squared``, or one is within ``near_squared``.
+    """
+
+    def __init__(self, landmarks: Tensor, near_squared: float, far_squared: float):
+        self._landmarks = landmarks
+        self._near, self._far = near_squared**0.5, far_squared**0.5
+        self._places: Tensor | None = None
+
+    @torch.no_grad()
+    def __call__(self, points: Tensor) -> Tensor:
+        """(N,) indices for (N, 3) points, the same ones in all calls."""
+        if self._places is None:
+            self._places, self._room = points.clone(), points.new_zeros(len(points))
+            self._nearest = torch.zeros_like(self._room, dtype=torch.int64)
+        moved = torch.linalg.vector_norm(points - self._places, dim=1)
+        rows = (moved >= self._room).nonzero().squeeze(1)
+        places = points.index_select(0, rows)
+        # Differences, since the squares of the faster mode are inexact at small distances.
+        distances = torch.cdist(places, self._landmarks, compute_mode="donot_use_mm_for_euclid_dist")
+        found = distances.topk(min(2, len(self._landmarks)), dim=1, largest=False)
+        first, second = found.values[:, 0], found.values[:, -1]
+        room = torch.maximum(0.5 * (second - first), torch.maximum(first - self._far, self._near - first))
+        self._places.index_copy_(0, rows, places)
+        self._room.index_copy_(0, rows, room - ROUNDING)
+        self._nearest.index_copy_(0, rows, found.indices[:, 0])
+        return self._nearest
+
+
 def influences(
-    points: Tensor, landmarks: Tensor, near_squared: float, far_squared: float
+    points: Tensor, landmarks: Tensor, near_squared: float, far_squared: float, nearest: Tensor | None = None
 ) -> tuple[Influence, Influence]:
     """Influence of expression and of head pose on (N, 3) points; their weights add up to 1.
 
     Only expression has an effect up to ``near_squared`` from the nearest of the (L, 3) landmarks, only pose from
-    ``far_squared`` on; in between the weights are linear in the squared distance.
+    ``far_squared`` on; in between the weights are linear in the squared distance. ``nearest`` (N,) are the indices of
+    the nearest landmarks, if they are known.
     """
-    with torch.no_grad():
-        # |a - b|^2 without |a|^2, which is the same for all landmarks of a point. `min` is three times as fast as
-        # `argmin` on the CPU.
-        nearest = torch.addmm(landmarks.square().sum(1), points, landmarks.t(), alpha=-2).min(1).indices
+    if nearest is None:
+        with torch.no_grad():
+            # |a - b|^2 without |a|^2, which is the same for all landmarks of a point. `min` is three times as fast as
+            # `argmin` on the CPU.
+            nearest = torch.addmm(landmarks.square().sum(1), points, landmarks.t(), alpha=-2).min(1).indices
     squared = (points - landmarks.index_select(0, nearest)).square().sum(1)
     weight = ((far_squared - squared) / (far_squared - near_squared)).clamp(0, 1)
     near, far = (weight.detach() > 0).nonzero().squeeze(1), (weight.detach() < 1).nonzero().squeeze(1)

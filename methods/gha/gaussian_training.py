@@ -18,7 +18,7 @@ from ..ops.splats import unturned
 from ..shared.loop import TrainingImages
 from ..shared.optimisation import Optimiser, OptimiserState, logit
 from ..shared.schedule import Sampler, Timeline, torch_generator
-from .driving import POSE_SIZE, Signal, TrainingScene, mouth_box
+from .driving import POSE_SIZE, NearestLandmarks, Signal, TrainingScene, mouth_box
 from .gaussian_head import FeatureImage, GaussianHead, feature_background
 from .mesh_head import MeshHead, NeutralSurface, Weights
 from .mesh_training import TrackedMotion, grid_about
@@ -65,6 +65,7 @@ class GaussianTraining(OptimiserState):
             "code_low": scene.code_low,
             "code_high": scene.code_high,
         }
+        self._nearest = NearestLandmarks(self._fixed["landmarks"], config.near_squared, config.far_squared)
         self._motion = TrackedMotion.of(scene, config) if config.motion_weight else None
         self.optimiser = Optimiser({name: nn.Parameter(v) for name, v in initial.items()}, self._rates)
 
@@ -88,7 +89,8 @@ class GaussianTraining(OptimiserState):
         tensors = {**{name: self.optimiser[name] for name in self._rates}, **self._fixed}
         signal = scene.signals[row]
         motion = scene.driver.motion(signal, self.optimiser["corrections"][row])
-        splats = head.splats(tensors, signal, motion, self._noise(signal, iteration))
+        inputs = head.inputs(tensors, self._nearest(tensors["points"]))
+        splats = head.splats(tensors, signal, motion, self._noise(signal, iteration), inputs)
         drawn = head.draw(splats, view.camera, scene.background)
         padded = _padded(target, view.camera, config.upscale, scene.background)
         small = reduced(padded, config.upscale, config.low_image_variant)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from headbench.datasets.head.model import HeadModel, PosedSubject
 from headbench.methods.gha.driving import (
     Driver,
+    NearestLandmarks,
     bounds,
     code_size,
     expression_codes,
@@ -237,6 +238,25 @@ def test_influences_are_the_published_clamp(seed, near_squared, width):
     # Only where a controller has a say is it evaluated.
     assert set(near.rows.tolist()) == set(np.flatnonzero(expected > 0))
     assert set(far.rows.tolist()) == set(np.flatnonzero(expected < 1))
+
+
+@pytest.mark.parametrize("landmarks", [1, 2, 30])
+def test_influences_of_points_that_move_are_those_of_a_search(landmarks):
+    generator = torch.Generator().manual_seed(landmarks)
+    centers = 0.6 * torch.randn(landmarks, 3, generator=generator)
+    points = 0.6 * torch.randn(400, 3, generator=generator)
+    nearest = NearestLandmarks(centers, 0.1, 0.25)
+    changed = 0
+    for step in range(20):
+        before = influences(points, centers, 0.1, 0.25)
+        points = points + (0.2 if step == 10 else 0.01) * torch.randn(400, 3, generator=generator)
+        expected = influences(points, centers, 0.1, 0.25)
+        found = influences(points, centers, 0.1, 0.25, nearest(points))
+        changed += sum(not torch.equal(old.rows, new.rows) for old, new in zip(before, expected))
+        for one, other in zip(found, expected, strict=True):
+            assert torch.equal(one.rows, other.rows)
+            torch.testing.assert_close(one.weights, other.weights)
+    assert changed
 
 
 def test_the_mouth_box_reaches_from_the_lips_back():

@@ -98,8 +98,8 @@ def test_only_drawn_surroundings_are_coloured():
     alpha = torch.zeros(9, 9)
     alpha[2, 3] = 0.5
     near = near_drawn(alpha)
-    expected = torch.zeros(9, 9)
-    expected[0:5, 1:6] = 1
+    expected = torch.zeros(9, 9, dtype=torch.bool)
+    expected[0:5, 1:6] = True
     assert torch.equal(near, expected)
     large = enlarged(near, 2)
     assert large.shape == (18, 18)
