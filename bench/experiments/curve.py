@@ -14,7 +14,14 @@ import tyro
 from ..condition import PLAIN, Condition, Named, part_of_text
 from ..contracts import Avatar, Budget, Clip, Progress, no_progress
 from ..engine.captures import PROGRAMS, check_trusted, open_run_clips, run_configuration
-from ..engine.config import ResolvedMethod, RunOptions, default_names, resolve_methods, with_methods
+from ..engine.config import (
+    ResolvedMethod,
+    RunConfig,
+    RunOptions,
+    default_names,
+    resolve_methods,
+    with_methods,
+)
 from ..engine.plan import trained
 from ..engine.run import run
 from ..engine.scoring import TrainingView
@@ -137,7 +144,7 @@ class CurveSettings(RunOptions, ExecutionOptions):
     """Quality against training time, cameras, timesteps, images or tracking error. Each method is trained with parts of them.
 
     Each part, number or level is a separate training. Quality is measured on training frames that are held out of every
-    training, the same for all parts, never on test frames."""
+    training, the same for all parts, never on test frames, unless --test asks for them."""
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run."""
@@ -172,6 +179,14 @@ class CurveSettings(RunOptions, ExecutionOptions):
     every: int = 8
     """Hold out one of this number of consecutive training timesteps."""
 
+    test: bool = False
+    """Measure on the test frames of the captures instead: new views, and new expressions at seen and unseen cameras. For results;
+    choose no setting by them that is used on the same captures. Not with --camera or --every."""
+
+    until_flat: bool = False
+    """With `--over budget` or `--over seconds`: begin with the shortest training, and end a method's curve where twice the length gains
+    less than 0.05 dB at training cameras, or the other cameras get worse: in the face if the captures have it."""
+
     frames: int = 100
     """Maximum number of scored frames of each subject, for the held-out camera and timesteps separately."""
 
@@ -180,6 +195,8 @@ class CurveSettings(RunOptions, ExecutionOptions):
         DependentOptions(("seconds",), "over", ("seconds",)),
         DependentOptions(("pictures",), "over", ("pictures",)),
         DependentOptions(("fractions",), "over", ("budget", "cameras", "timesteps")),
+        DependentOptions(("until_flat",), "over", ("budget", "seconds")),
+        DependentOptions(("camera", "every"), "test", False),
     )
 
     def __post_init__(self) -> None:
@@ -243,25 +260,42 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
     wanted = _wanted(settings, source)
     with locked(out):
         config, opened = open_run_clips(source.root, settings, out=out)
-        held = Named("hold-out", {"camera": settings.camera, "every": settings.every})
+        how = {"test": True} if settings.test else {}
+        held = Named("hold-out", {"camera": settings.camera, "every": settings.every, **how})
         config = replace(
             with_methods(config, _names(wanted)),
             clip=held,
             frames_per_task=settings.frames,
             metrics=(*METRICS, *COSTS),
             metric_profiles=("canonical",),
-            regions=(),
+            regions=None,
             source="",
         )
         clips: list[Clip] = [hold_out(clip, config, **held.parameters) for clip in opened]
         tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in clips))
-        config = replace(config, tasks=tasks, conditions=tuple(conditions(settings, wanted, clips)))
-        _drop_interrupted(out)
-        unchecked = bool(manifest.unchecked)  # for a run whose captures have errors
-        run(config, execution, clips=clips, is_locked=True, reports=False, unchecked=unchecked)
-        from ...reports.curve.curve import curve_report
+        config = replace(config, tasks=tasks)
+        planned = tuple(conditions(settings, wanted, clips))
 
-        return curve_report(out, settings.over)
+        def measure(config: RunConfig) -> None:
+            _drop_interrupted(Path(config.out))
+            unchecked = bool(manifest.unchecked)  # for a run whose captures have errors
+            run(config, execution, clips=clips, is_locked=True, reports=False, unchecked=unchecked)
+
+        from ...reports.curve.curve import curve_report, rising
+
+        if not settings.until_flat:
+            measure(replace(config, conditions=planned))
+            return curve_report([out], settings.over, out)
+        parts: list[Path] = []
+        left = set(_names(wanted))
+        for condition in reversed(planned):
+            names = left & {*(condition.methods or left)}
+            if names:
+                parts.append(out / condition.name)
+                part = replace(config, conditions=(replace(condition, methods=()),), out=str(parts[-1]))
+                measure(with_methods(part, names))
+                left -= names - rising(parts, settings.over)
+        return curve_report(parts, settings.over, out)
 
 
 def conditions(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -99,7 +99,9 @@ class HeldOutClip:
         return key
 
 
-def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", every: int = 8) -> HeldOutClip:
+def hold_out(
+    clip: Clip, config: RunConfig | None = None, *, camera: str = "", every: int = 8, test: bool = False
+) -> HeldOutClip:
     """Hold out a camera and every n-th timestep of a clip's training split, so that no test frame is used.
 
     Parameters
@@ -109,7 +111,14 @@ def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", e
         there is only one.
     every : int
         The middle one of each group of ``every`` consecutive training timesteps is held out.
+    test : bool
+        Hold out nothing, and score the capture's own test frames.
     """
+    if test:
+        training = _training(clip.splits["train"])
+        step = StepRecord("hold_out", {"camera": "", "timesteps": [], "training": training}, clip.fingerprint)
+        fingerprint = digest(clip.fingerprint, "hold_out", "test")
+        return replace(_as_held_out(clip), steps=(*clip.steps, step), fingerprint=fingerprint)
     train = clip.splits["train"]
     where = f"clip {clip.subject}"
     if every < 2:
@@ -130,19 +139,20 @@ def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", e
         found = f"{len(cameras)} cameras and {len(timesteps)} timesteps"
         expected = "frames to train with and others to hold out"
         raise InputError(where, "splits.train", expected, found)
-    training = {
-        "cameras": sorted({key.camera for key in splits["train"]}),
-        "timesteps": sorted({key.timestep for key in splits["train"]}),
-    }
-    step = StepRecord(
-        "hold_out", {"camera": camera, "timesteps": held, "training": training}, clip.fingerprint
-    )
+    parameters = {"camera": camera, "timesteps": held, "training": _training(splits["train"])}
+    step = StepRecord("hold_out", parameters, clip.fingerprint)
     return replace(
         _as_held_out(clip),
         splits={name: tuple(keys) for name, keys in splits.items() if keys},
         steps=(*clip.steps, step),
         fingerprint=digest(clip.fingerprint, "hold_out", camera, held),
     )
+
+
+def _training(keys: Iterable[FrameKey]) -> dict[str, list[Any]]:
+    """Cameras and timesteps of frames."""
+    names = ("cameras", "timesteps")
+    return {name: sorted({getattr(key, name.removesuffix("s")) for key in keys}) for name in names}
 
 
 def fewer_cameras(clip: Clip, config: RunConfig | None = None, *, part: str) -> Clip:

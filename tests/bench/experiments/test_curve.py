@@ -220,6 +220,34 @@ def test_the_held_out_camera_and_timesteps_can_be_chosen(make_run, plugin):
         curve_run(settings(run, fractions=("1",)))
 
 
+def test_test_frames_are_scored_by_camera_where_asked_for(make_run, plugin):
+    findings = curve_run(settings(make_run("curve_plugin:METHOD"), fractions=("1",), test=True))
+    ((train, _),) = plugin.FITS
+    assert {(key.timestep, key.camera) for key in train} == {(t, c) for t in range(4) for c in "0134"}
+    assert set(plugin.RENDERED) == {(t, "2") for t in range(4)} | {(t, c) for t in (4, 5) for c in "01234"}
+    (point,) = findings.data["points"]
+    seen, unseen = (point[f"psnr_expressions_{name}"] for name in ("seen", "unseen"))
+    assert seen == pytest.approx(unseen)  # a ball frame is as bright in all cameras
+    assert "Test frames of the captures." in findings.text
+
+
+@pytest.mark.parametrize("over", ["budget", "seconds"])
+def test_a_curve_ends_where_a_longer_training_is_worse(make_run, plugin, over):
+    """Renders get brighter with the length, and all frames are dark."""
+    run = make_run("curve_plugin:METHOD")
+    lengths = {"fractions": ("1/16", "1/4", "1")} if over == "budget" else {"seconds": (4.0, 16.0, 64.0)}
+    asked = settings(run, over=over, until_flat=True, **lengths)
+    findings = curve_run(asked)
+    assert [budget.iterations or budget.seconds for _, budget in plugin.FITS] == [4, 16]
+    assert len(findings.data["points"]) == 2
+    curve_run(asked)
+    assert len(plugin.FITS) == 2
+    joined = curve_runs(CurveReportSettings((str(findings.data["out"]),), str(run / "joined"), over))
+    assert [p["psnr_camera"] for p in joined.data["points"]] == [
+        p["psnr_camera"] for p in findings.data["points"]
+    ]
+
+
 def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):
     clip = importlib.import_module("ball_plugin").BallClip(tmp_path / "ball-a")
     clip.splits["train"] = tuple(key for key in clip.splits["train"] if key.camera == "3")
