@@ -12,6 +12,7 @@ from pathlib import Path
 import tyro
 
 from ..condition import PLAIN, Condition, Named, part_of_text
+from ..configuration import merge
 from ..contracts import Avatar, Budget, Clip, Progress, no_progress
 from ..engine.captures import PROGRAMS, check_trusted, open_run_clips, run_configuration
 from ..engine.config import (
@@ -30,7 +31,7 @@ from ..errors import InputError
 from ..executors.settings import ExecutionOptions
 from ..io.files import check_kind, check_name
 from ..io.lock import locked
-from ..options import DependentOptions
+from ..options import DependentOptions, iterations
 from ..registry import get, resolve
 from ..specs import CommandResult, MethodSpec, command
 from .held_out import CAMERA, TIMESTEPS, count_of, hold_out
@@ -159,6 +160,9 @@ class CurveSettings(RunOptions, ExecutionOptions):
     """What is varied: fractions of budget, cameras or timesteps; numbers of seconds of training or of images (pictures); or the
     tracking error of a synthetic capture, whose images stay the same."""
 
+    iterations: tuple[str, ...] = ()
+    """METHOD=NUMBER: iterations of the whole budgets, instead of those of the run. Only with `--over budget`."""
+
     fractions: tuple[str, ...] = ()
     """Parts of the method's budget, or of the training cameras or timesteps, above 0 and at most 1; default: 1/16 1/8 1/4 1/2
     1. Not with `--over tracking_error`."""
@@ -195,11 +199,13 @@ class CurveSettings(RunOptions, ExecutionOptions):
         DependentOptions(("seconds",), "over", ("seconds",)),
         DependentOptions(("pictures",), "over", ("pictures",)),
         DependentOptions(("fractions",), "over", ("budget", "cameras", "timesteps")),
+        DependentOptions(("iterations",), "over", ("budget",)),
         DependentOptions(("until_flat",), "over", ("budget", "seconds")),
         DependentOptions(("camera", "every"), "test", False),
     )
 
     def __post_init__(self) -> None:
+        iterations(self.iterations)
         if len(set(self.parts)) != len(self.parts):
             raise ValueError(f"fractions: each once; found {' '.join(self.fractions)}")
         if len(set(self.levels)) != len(self.levels):
@@ -263,7 +269,7 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
         how = {"test": True} if settings.test else {}
         held = Named("hold-out", {"camera": settings.camera, "every": settings.every, **how})
         config = replace(
-            with_methods(config, _names(wanted)),
+            with_methods(_lengthened(config, settings), _names(wanted)),
             clip=held,
             frames_per_task=settings.frames,
             metrics=(*METRICS, *COSTS),
@@ -357,11 +363,18 @@ def _names(methods: Sequence[ResolvedMethod]) -> list[str]:
     return [method.spec.name for method in methods]
 
 
+def _lengthened(config: RunConfig, settings: CurveSettings) -> RunConfig:
+    """The run's configuration with the budgets asked for."""
+    return replace(config, settings=merge(config.settings, iterations(settings.iterations)))
+
+
 def _wanted(settings: CurveSettings, source: RunFolder) -> list[ResolvedMethod]:
     """The methods to train, each with a budget."""
     trained = {record.name for record in source.read_manifest().methods}
     resolved = [
-        m for m in resolve_methods(run_configuration(source.root, settings)) if m.spec.name in trained
+        m
+        for m in resolve_methods(_lengthened(run_configuration(source.root, settings), settings))
+        if m.spec.name in trained
     ]
     names = ", ".join(_names(resolved)) or "none that it trained"
     for name in settings.methods:

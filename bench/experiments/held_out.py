@@ -12,6 +12,7 @@ import numpy as np
 
 from ..condition import part_of_text
 from ..contracts import (
+    BoolArray,
     ByteArray,
     Camera,
     Clip,
@@ -19,6 +20,7 @@ from ..contracts import (
     FrameKey,
     HeadAsset,
     HeadPose,
+    RegionalClip,
     StepRecord,
     TaskName,
 )
@@ -88,6 +90,16 @@ class HeldOutClip:
     def mask(self, key: FrameKey) -> ByteArray | None:
         """(H, W) 8-bit coverage or None."""
         return self.source.mask(self._checked(key))
+
+    @property
+    def region_names(self) -> Sequence[str]:
+        """Regions of the source; none if it has none."""
+        return self.source.region_names if isinstance(self.source, RegionalClip) else ()
+
+    def region_masks(self, key: FrameKey, names: Sequence[str]) -> Mapping[str, BoolArray]:
+        """(H, W) masks of the regions."""
+        assert isinstance(self.source, RegionalClip)
+        return self.source.region_masks(self._checked(key), names)
 
     @cached_property
     def _readable(self) -> frozenset[FrameKey]:

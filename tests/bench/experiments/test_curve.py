@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -229,6 +230,24 @@ def test_test_frames_are_scored_by_camera_where_asked_for(make_run, plugin):
     seen, unseen = (point[f"psnr_expressions_{name}"] for name in ("seen", "unseen"))
     assert seen == pytest.approx(unseen)  # a ball frame is as bright in all cameras
     assert "Test frames of the captures." in findings.text
+
+
+def test_the_face_is_measured_where_captures_have_it(make_run, monkeypatch):
+    ball = importlib.import_module("ball_plugin")
+    masks = {"face": np.arange(ball.SIZE[0] * ball.SIZE[1]).reshape(ball.SIZE[::-1]) > 60}
+    monkeypatch.setattr(ball.BallClip, "region_names", ("face",), raising=False)
+    monkeypatch.setattr(ball.BallClip, "region_masks", lambda clip, key, names: masks, raising=False)
+    (point,) = curve_run(settings(make_run("curve_plugin:METHOD"), fractions=("1",))).data["points"]
+    assert point["psnr_face_camera"] == pytest.approx(point["psnr_camera"])  # grey on grey
+    assert point["psnr_face_timesteps"] == pytest.approx(point["psnr_timesteps"])
+
+
+def test_parts_may_be_of_another_number_of_iterations(make_run, plugin):
+    run = make_run("curve_plugin:METHOD")
+    curve_run(settings(run, fractions=("1/4", "1"), iterations=("noting=400",)))
+    assert [budget for _, budget in plugin.FITS] == [Budget(400), Budget(100)]
+    with pytest.raises(InputError, match="NAME=NUMBER"):
+        settings(run, iterations=("noting",))
 
 
 @pytest.mark.parametrize("over", ["budget", "seconds"])
