@@ -184,7 +184,7 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
                 how = {name: getattr(settings, name) for name in ("executor", "workers", "set")}
                 extremes_run(ExtremesSettings(of_subject.out, **how), progress)
             ends.append(closing(done[-1], rows))
-            write_text(out / "results.md", suite_report(out, OURS))
+        write_text(out / "results.md", suite_report(out, OURS))
     data = {"out": out, "runs": done, "failed": sorted({*failed})}
     return CommandResult(
         "\n\n".join([f"Tables of all results: {out / 'results.md'}", *ends]), data, not failed

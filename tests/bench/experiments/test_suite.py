@@ -13,9 +13,8 @@ from headbench.bench.engine.config import resolve_cells, resolve_method
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.experiments import suite as module
 from headbench.bench.experiments.specs import MOVED_LINES
-from headbench.bench.rows import ALL
 from headbench.datasets.open import open_clip
-from headbench.datasets.synthetic.plan import FRONTAL
+from headbench.datasets.synthetic.plan import FRONTAL, serials
 from headbench.methods.ours.spec import ADDITIONS, OURS, OURS_PLUS
 
 SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16x16")
@@ -23,8 +22,10 @@ SMALL = ("--subjects", "2", "--cameras", "2", "--timesteps", "60", "--size", "16
 
 @pytest.mark.slow
 def test_the_suite_makes_subjects_and_tables_by_region_and_part(tmp_path, capsys):
+    """With the other camera held out than in the captures' own splits."""
+    (other,) = {*serials(2)} - {FRONTAL}
     words = ["run", "suite", "--out", str(tmp_path / "s"), "--methods", "mean-image", "ga", "ours"]
-    words += ["--preset", "smoke", *SMALL, "--extremes", "1", "--repeated", "2"]
+    words += ["--preset", "smoke", *SMALL, "--extremes", "1", "--repeated", "1", "--held-out-cameras", other]
     assert cli.main(words) == 0
     text = (tmp_path / "s" / "results.md").read_text()
     endpoints, recorded, exact = (re.findall("^## (.*)", part, re.MULTILINE) for part in text.split("\n# "))
@@ -33,9 +34,14 @@ def test_the_suite_makes_subjects_and_tables_by_region_and_part(tmp_path, capsys
     tables += ["Cost", "Speed", "Mechanism", "Conditions of ours"]
     assert (endpoints, recorded) == (["Primary endpoints"], tables)
     assert exact == [*tables, "New poses and views", "Variance between and within subjects"]
-    assert text.count("not testable with 2 subjects") == 5
-    assert text.count("2 subjects") >= 2 * len(parts)
+    assert text.count("not testable with 2 subjects") == 3
+    assert text.count("no comparison") == 2  # LPIPS of so small images
     assert f"Tables of all results: {tmp_path / 's' / 'results.md'}" in capsys.readouterr().out
+    scored = RunFolder(tmp_path / "s" / "run-recorded" / "01").read_manifest().protocols
+    own = open_clip(tmp_path / "s" / "capture-recorded" / "UNION14_900")
+    assert {*scored["self_reenactment"].keys} == {*own.splits["self_reenactment"]}
+    others = {key for keys in own.splits.values() for key in keys} - {*own.splits["self_reenactment"]}
+    assert {*scored["novel_view"].keys} == {key for key in others if key.camera == other}
     made = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.png")}
     assert cli.main(words) == 0
     assert all(path.stat().st_mtime_ns == time for path, time in made.items() if "renders" in path.parts)
@@ -175,29 +181,6 @@ def test_the_page_has_the_output_of_its_command(capsys):
     assert f"seed {module.SEED}" in page
     (measured,) = re.findall(r"^headbench (run suite (?!.*--plan).*)$", page, re.MULTILINE)
     assert words.startswith(measured)
-
-
-@pytest.mark.slow
-def test_held_out_cameras_are_the_novel_views(tmp_path):
-    """On the recorded capture, whose own split has the frontal camera; sequences and all else are as in it."""
-    words = ["run", "suite", "--out", str(tmp_path / "s"), "--methods", "mean-image", "--preset", "smoke"]
-    words += [*ONE, "--cameras", "3", "--timesteps", "60", "--size", "24x34"]
-    held_out = [FRONTAL, "221501007"]
-    assert cli.main([*words, "--held-out-cameras", *held_out]) == 0
-    folder = RunFolder(tmp_path / "s" / "run-recorded" / "01")
-    manifest = folder.read_manifest()
-    own = open_clip(tmp_path / "s" / "capture-recorded")
-    scored = {task: {*protocol.keys} for task, protocol in manifest.protocols.items()}
-    every = {key for keys in own.splits.values() for key in keys}
-    assert scored["self_reenactment"] == {*own.splits["self_reenactment"]}
-    others = every - scored["self_reenactment"]
-    assert scored["novel_view"] == {key for key in others if key.camera in held_out}
-    assert {key.camera for key in own.splits["novel_view"]} == {FRONTAL}
-    values = folder.read_rows(manifest).select(
-        method="mean-image", metric="lpips-face", task="novel_view", region="full", seeds=ALL
-    )
-    assert len(values) == len(scored["novel_view"])
-    assert (values["status"] == "ok").all()
 
 
 def test_ablations_change_ours_and_additions_make_ours_plus():
