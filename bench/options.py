@@ -1,7 +1,8 @@
-"""Options of a command that have no effect without, or with, another one: refused instead of ignored."""
+"""Options of a command: those that have no effect without, or with, another one are refused; numbers by name."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, fields
 from typing import Any, NamedTuple, get_type_hints
@@ -22,6 +23,22 @@ class DependentOptions(NamedTuple):
     """Name of the attribute that they depend on."""
     values: tuple[str, ...] | bool = True
     """Values of ``other`` with which the options have an effect. True: ``other`` is given; False: it is not."""
+
+
+def numbers(words: Iterable[str], option: str) -> dict[str, int]:
+    """Parse words NAME=NUMBER of an option, whole numbers from 1."""
+    parsed = {}
+    for word in words:
+        name, _, number = word.partition("=")
+        if not name or not re.fullmatch("[1-9][0-9]{0,8}", number):
+            raise InputError("command line", option, "NAME=NUMBER, whole numbers from 1", word)
+        parsed[name] = int(number)
+    return parsed
+
+
+def iterations(words: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Settings of methods from words METHOD=NUMBER of the option ``--iterations``."""
+    return {name: {"budget": {"iterations": n}} for name, n in numbers(words, "--iterations").items()}
 
 
 def check_dependent(

@@ -170,7 +170,7 @@ def cell(method):
 
 OTHERS = "synth --out others --subjects 2 --cameras 2 --timesteps 4 --size 24x32"
 PLAIN = "run --data {capture} --out plain --methods mean-image,nearest-camera --preset smoke --set metrics=psnr,ssim,fps --set frames_per_task=3"
-SUITE = "run suite --out suite --methods mean-image --preset smoke --subjects 1 --cameras 2 --timesteps 60 --size 16x16 --large 1"
+SUITE = "run suite --out suite --methods mean-image --preset smoke --subjects 1 --cameras 2 --timesteps 60 --size 16x16"
 GATE = "compare plain --baseline baseline.json"
 PREPARE = (
     "prepare nersemble --root recording/recording --tracking recording/tracking --head recording/head.npz"
@@ -192,7 +192,7 @@ CASES = {
             "Tables of all results: suite/results.md",
             "suite/results.md",
             "suite/run/01/rows.parquet",
-            "suite/run-large/01/rows.parquet",
+            "suite/run-recorded/01/rows.parquet",
         )
     ],
     "list": [

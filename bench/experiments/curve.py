@@ -12,9 +12,17 @@ from pathlib import Path
 import tyro
 
 from ..condition import PLAIN, Condition, Named, part_of_text
+from ..configuration import merge
 from ..contracts import Avatar, Budget, Clip, Progress, no_progress
 from ..engine.captures import PROGRAMS, check_trusted, open_run_clips, run_configuration
-from ..engine.config import ResolvedMethod, RunOptions, default_names, resolve_methods, with_methods
+from ..engine.config import (
+    ResolvedMethod,
+    RunConfig,
+    RunOptions,
+    default_names,
+    resolve_methods,
+    with_methods,
+)
 from ..engine.plan import trained
 from ..engine.run import run
 from ..engine.scoring import TrainingView
@@ -23,7 +31,7 @@ from ..errors import InputError
 from ..executors.settings import ExecutionOptions
 from ..io.files import check_kind, check_name
 from ..io.lock import locked
-from ..options import DependentOptions
+from ..options import DependentOptions, iterations
 from ..registry import get, resolve
 from ..specs import CommandResult, MethodSpec, command
 from .held_out import CAMERA, TIMESTEPS, count_of, hold_out
@@ -137,7 +145,7 @@ class CurveSettings(RunOptions, ExecutionOptions):
     """Quality against training time, cameras, timesteps, images or tracking error. Each method is trained with parts of them.
 
     Each part, number or level is a separate training. Quality is measured on training frames that are held out of every
-    training, the same for all parts, never on test frames."""
+    training, the same for all parts, never on test frames, unless --test asks for them."""
 
     run: tyro.conf.Positional[str]
     """Folder of a finished run."""
@@ -151,6 +159,9 @@ class CurveSettings(RunOptions, ExecutionOptions):
     over: Over = "budget"
     """What is varied: fractions of budget, cameras or timesteps; numbers of seconds of training or of images (pictures); or the
     tracking error of a synthetic capture, whose images stay the same."""
+
+    iterations: tuple[str, ...] = ()
+    """METHOD=NUMBER: iterations of the whole budgets, instead of those of the run. Only with `--over budget`."""
 
     fractions: tuple[str, ...] = ()
     """Parts of the method's budget, or of the training cameras or timesteps, above 0 and at most 1; default: 1/16 1/8 1/4 1/2
@@ -172,6 +183,14 @@ class CurveSettings(RunOptions, ExecutionOptions):
     every: int = 8
     """Hold out one of this number of consecutive training timesteps."""
 
+    test: bool = False
+    """Measure on the test frames of the captures instead: new views, and new expressions at seen and unseen cameras. For results;
+    choose no setting by them that is used on the same captures. Not with --camera or --every."""
+
+    until_flat: bool = False
+    """With `--over budget` or `--over seconds`: begin with the shortest training, and end a method's curve where twice the length gains
+    less than 0.05 dB at training cameras, or the other cameras get worse: in the face if the captures have it."""
+
     frames: int = 100
     """Maximum number of scored frames of each subject, for the held-out camera and timesteps separately."""
 
@@ -180,9 +199,13 @@ class CurveSettings(RunOptions, ExecutionOptions):
         DependentOptions(("seconds",), "over", ("seconds",)),
         DependentOptions(("pictures",), "over", ("pictures",)),
         DependentOptions(("fractions",), "over", ("budget", "cameras", "timesteps")),
+        DependentOptions(("iterations",), "over", ("budget",)),
+        DependentOptions(("until_flat",), "over", ("budget", "seconds")),
+        DependentOptions(("camera", "every"), "test", False),
     )
 
     def __post_init__(self) -> None:
+        iterations(self.iterations)
         if len(set(self.parts)) != len(self.parts):
             raise ValueError(f"fractions: each once; found {' '.join(self.fractions)}")
         if len(set(self.levels)) != len(self.levels):
@@ -243,25 +266,42 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
     wanted = _wanted(settings, source)
     with locked(out):
         config, opened = open_run_clips(source.root, settings, out=out)
-        held = Named("hold-out", {"camera": settings.camera, "every": settings.every})
+        how = {"test": True} if settings.test else {}
+        held = Named("hold-out", {"camera": settings.camera, "every": settings.every, **how})
         config = replace(
-            with_methods(config, _names(wanted)),
+            with_methods(_lengthened(config, settings), _names(wanted)),
             clip=held,
             frames_per_task=settings.frames,
             metrics=(*METRICS, *COSTS),
             metric_profiles=("canonical",),
-            regions=(),
+            regions=None,
             source="",
         )
         clips: list[Clip] = [hold_out(clip, config, **held.parameters) for clip in opened]
         tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in clips))
-        config = replace(config, tasks=tasks, conditions=tuple(conditions(settings, wanted, clips)))
-        _drop_interrupted(out)
-        unchecked = bool(manifest.unchecked)  # for a run whose captures have errors
-        run(config, execution, clips=clips, is_locked=True, reports=False, unchecked=unchecked)
-        from ...reports.curve.curve import curve_report
+        config = replace(config, tasks=tasks)
+        planned = tuple(conditions(settings, wanted, clips))
 
-        return curve_report(out, settings.over)
+        def measure(config: RunConfig) -> None:
+            _drop_interrupted(Path(config.out))
+            unchecked = bool(manifest.unchecked)  # for a run whose captures have errors
+            run(config, execution, clips=clips, is_locked=True, reports=False, unchecked=unchecked)
+
+        from ...reports.curve.curve import curve_report, rising
+
+        if not settings.until_flat:
+            measure(replace(config, conditions=planned))
+            return curve_report([out], settings.over, out)
+        parts: list[Path] = []
+        left = set(_names(wanted))
+        for condition in reversed(planned):
+            names = left & {*(condition.methods or left)}
+            if names:
+                parts.append(out / condition.name)
+                part = replace(config, conditions=(replace(condition, methods=()),), out=str(parts[-1]))
+                measure(with_methods(part, names))
+                left -= names - rising(parts, settings.over)
+        return curve_report(parts, settings.over, out)
 
 
 def conditions(
@@ -323,11 +363,18 @@ def _names(methods: Sequence[ResolvedMethod]) -> list[str]:
     return [method.spec.name for method in methods]
 
 
+def _lengthened(config: RunConfig, settings: CurveSettings) -> RunConfig:
+    """The run's configuration with the budgets asked for."""
+    return replace(config, settings=merge(config.settings, iterations(settings.iterations)))
+
+
 def _wanted(settings: CurveSettings, source: RunFolder) -> list[ResolvedMethod]:
     """The methods to train, each with a budget."""
     trained = {record.name for record in source.read_manifest().methods}
     resolved = [
-        m for m in resolve_methods(run_configuration(source.root, settings)) if m.spec.name in trained
+        m
+        for m in resolve_methods(_lengthened(run_configuration(source.root, settings), settings))
+        if m.spec.name in trained
     ]
     names = ", ".join(_names(resolved)) or "none that it trained"
     for name in settings.methods:

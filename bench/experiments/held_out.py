@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from ..condition import part_of_text
 from ..contracts import (
+    BoolArray,
     ByteArray,
     Camera,
     Clip,
@@ -19,6 +20,7 @@ from ..contracts import (
     FrameKey,
     HeadAsset,
     HeadPose,
+    RegionalClip,
     StepRecord,
     TaskName,
 )
@@ -89,6 +91,16 @@ class HeldOutClip:
         """(H, W) 8-bit coverage or None."""
         return self.source.mask(self._checked(key))
 
+    @property
+    def region_names(self) -> Sequence[str]:
+        """Regions of the source; none if it has none."""
+        return self.source.region_names if isinstance(self.source, RegionalClip) else ()
+
+    def region_masks(self, key: FrameKey, names: Sequence[str]) -> Mapping[str, BoolArray]:
+        """(H, W) masks of the regions."""
+        assert isinstance(self.source, RegionalClip)
+        return self.source.region_masks(self._checked(key), names)
+
     @cached_property
     def _readable(self) -> frozenset[FrameKey]:
         return frozenset(key for keys in self.splits.values() for key in keys)
@@ -99,7 +111,9 @@ class HeldOutClip:
         return key
 
 
-def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", every: int = 8) -> HeldOutClip:
+def hold_out(
+    clip: Clip, config: RunConfig | None = None, *, camera: str = "", every: int = 8, test: bool = False
+) -> HeldOutClip:
     """Hold out a camera and every n-th timestep of a clip's training split, so that no test frame is used.
 
     Parameters
@@ -109,7 +123,14 @@ def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", e
         there is only one.
     every : int
         The middle one of each group of ``every`` consecutive training timesteps is held out.
+    test : bool
+        Hold out nothing, and score the capture's own test frames.
     """
+    if test:
+        training = _training(clip.splits["train"])
+        step = StepRecord("hold_out", {"camera": "", "timesteps": [], "training": training}, clip.fingerprint)
+        fingerprint = digest(clip.fingerprint, "hold_out", "test")
+        return replace(_as_held_out(clip), steps=(*clip.steps, step), fingerprint=fingerprint)
     train = clip.splits["train"]
     where = f"clip {clip.subject}"
     if every < 2:
@@ -130,19 +151,20 @@ def hold_out(clip: Clip, config: RunConfig | None = None, *, camera: str = "", e
         found = f"{len(cameras)} cameras and {len(timesteps)} timesteps"
         expected = "frames to train with and others to hold out"
         raise InputError(where, "splits.train", expected, found)
-    training = {
-        "cameras": sorted({key.camera for key in splits["train"]}),
-        "timesteps": sorted({key.timestep for key in splits["train"]}),
-    }
-    step = StepRecord(
-        "hold_out", {"camera": camera, "timesteps": held, "training": training}, clip.fingerprint
-    )
+    parameters = {"camera": camera, "timesteps": held, "training": _training(splits["train"])}
+    step = StepRecord("hold_out", parameters, clip.fingerprint)
     return replace(
         _as_held_out(clip),
         splits={name: tuple(keys) for name, keys in splits.items() if keys},
         steps=(*clip.steps, step),
         fingerprint=digest(clip.fingerprint, "hold_out", camera, held),
     )
+
+
+def _training(keys: Iterable[FrameKey]) -> dict[str, list[Any]]:
+    """Cameras and timesteps of frames."""
+    names = ("cameras", "timesteps")
+    return {name: sorted({getattr(key, name.removesuffix("s")) for key in keys}) for name in names}
 
 
 def fewer_cameras(clip: Clip, config: RunConfig | None = None, *, part: str) -> Clip:

@@ -11,12 +11,11 @@ Over: TypeAlias = Literal["budget", "seconds", "cameras", "timesteps", "pictures
 RECORD_FILE = "record.json"
 """Results of `run extremes` and `run reenact`."""
 
-TRACKED, LEVEL, AS_TRACKED, EQUAL = "tracked", "tracking-{:g}", "as-tracked", "equal-iterations"
-"""Conditions of the suite: tracking estimated from images; a level of simulated tracking errors; the capture's own tracking
-without conversion; the same number of iterations as ga."""
-RUN, LARGE_RUN, SEEDS_RUN = "run", "run-large", "run-seeds"
-"""Folders of a suite's runs, each with one folder per subject. Runs in the second have images of twice the size, those in
-the third other training seeds."""
+MOVED_LINES = "lines-move-splats"
+"""The ablation of ours in the suite's endpoints."""
+RUN, RECORDED_RUN, SEEDS_RUN = "run", "run-recorded", "run-seeds"
+"""Folders of a suite's runs, each with one folder per subject: exact captures, captures as recordings are, and other training
+seeds on the latter."""
 
 HOLD_OUT = ConditionSpec(
     name="hold-out",

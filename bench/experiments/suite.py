@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ..comparison import closing, presets_of_methods
-from ..condition import PLAIN, Condition, Named
+from ..condition import PLAIN, Condition
 from ..contracts import Progress, no_progress
 from ..engine.config import (
     RunConfig,
@@ -19,25 +18,33 @@ from ..engine.config import (
     resolve_cells,
     resolve_methods,
     resolve_metrics,
+    with_methods,
 )
 from ..engine.plan import check_settings
 from ..engine.run import run
 from ..errors import InputError
 from ..executors.settings import ExecutionOptions, check_executor
 from ..io.files import write_text
+from ..options import iterations, numbers
 from ..registry import discover
 from ..specs import CommandResult, MethodSpec, command
 from .extremes import ExtremesSettings, extremes_run
-from .specs import AS_TRACKED, EQUAL, LARGE_RUN, LEVEL, RUN, SEEDS_RUN, TRACKED
+from .specs import MOVED_LINES, RECORDED_RUN, RUN, SEEDS_RUN
 
-SEED = 39_000
+SEED = 41_000
 """Seed of the suite's captures. Methods are tuned on captures with seeds below 10,000 (`docs/explanation/suite.md`)."""
 
-ALL, NONE = "all", "none"
-
-EQUAL_TO = "ga"
-TRACKED_METHODS = ("ga", "gbs", "ours", "ours-plus")
-"""Default methods of the conditions `TRACKED` and `LEVEL`."""
+ALL = "all"
+OURS, SEEDS_METHODS = "ours", ("ga", "ours")
+HELD_OUT_CAMERAS = ("222200037", "221501007", "222200041")
+"""The frontal camera, one at a side and a low one."""
+RECORDED: Mapping[str, Any] = {
+    "tracking_error": 1.0,
+    "correctives": 1.0,
+    "hair_lag": 1.0,
+    "camera_colour": 1.0,
+}
+"""Settings of captures as recordings are; they are 0 for exact captures."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +52,8 @@ class SuiteSettings(ExecutionOptions):
     """The whole benchmark: makes the synthetic subjects of the suite, trains and measures methods on all of them, and writes
     result tables.
 
-    Subjects differ in shape, skin, hair and performance. Each subject has a separate run, so that subjects can be measured on
-    different machines. If it is interrupted, the same command continues it. Takes hours.
+    Subjects differ in shape, skin, hair and performance. Each has two captures, an exact one and one with the errors of recordings,
+    with a separate run each, so that subjects can be measured on different machines. If it is interrupted, the same command continues it. Takes hours.
     """
 
     out: str
@@ -58,52 +65,32 @@ class SuiteSettings(ExecutionOptions):
     preset: str = "fast"
     """Preset, as for `headbench run`, whose help lists the presets."""
 
+    iterations: tuple[str, ...] = ()
+    """METHOD=NUMBER: iterations of methods, instead of those of the preset."""
+
     seeds: tuple[int, ...] = (0,)
     """Seeds of the training."""
 
     ablations: tuple[str, ...] = ()
     """Train a method with these parts left out or changed, too, each as a condition of the run (`headbench list methods --json` has
-    their names and settings); or "all" those of ours."""
-
-    tracked: tuple[str, ...] = ()
-    """Methods trained a second time, on tracking estimated from the images as by `headbench track`, as condition `tracked` of
-    the run; or "none". Default: those of ga, gbs, ours and ours-plus that run. Tracking takes about 1 second per timestep, once
-    per subject, and each method one more training."""
-
-    tracked_ablations: tuple[str, ...] = ()
-    """Train ours with these parts left out or changed also under the conditions of --tracked and --levels, as conditions such
-    as `no-lines-tracked`. This tests whether an effect depends on the tracking, for example lines-move-splats (Table 4 of the
-    paper)."""
-
-    levels: tuple[float, ...] = ()
-    """Train the methods of --tracked a further time for each of these levels of simulated tracking errors (see `headbench synth`), as
-    conditions such as `tracking-3`."""
-
-    equal_iterations: tuple[str, ...] = ()
-    """Methods trained a second time, with as many iterations as ga, as condition `equal-iterations`; or "none". Default: ours, if it
-    runs and has another number of iterations."""
+    their names and settings); or "all" those of ours. Default: lines-move-splats, which an endpoint has, if ours runs."""
 
     subjects: int = 10
-    """Number of the suite's subjects, from the first. Significant differences require 6 subjects for two
-    methods, 8 for five methods, 9 for ten ablations."""
+    """Number of the suite's subjects, from the first. The tests of the endpoints require 8."""
 
     first: int = 1
     """Begin with this subject, counted from 1. Earlier ones may have been measured on another machine."""
 
-    large: int = 2
-    """At most this many subjects, from the first, are also rendered at twice the size, in separate runs and tables, without
-    conditions. Each takes about half a processor hour to render, twice as long as at the usual size."""
-
     repeated: int = 0
-    """At most this many subjects, from the first, are also trained with two further seeds, without conditions, in separate
-    runs; `results.md` then has the variance between and within subjects."""
+    """On the captures as recordings are of at most this many subjects, from the first, ga and ours are also trained with a further
+    seed, in separate runs; `results.md` then has the variance between and within subjects."""
 
     extremes: int = 10
     """Avatars of at most this many subjects, from the first, are also rendered in new poses and views, as by `headbench run
     extremes`. A frame that exceeds a limit is a result, not a failure."""
 
     cameras: int = 16
-    """Number of cameras, including the held-out one."""
+    """Number of cameras, including the held-out ones."""
 
     timesteps: int = 96
     """Number of timesteps of each subject; a quarter is held out."""
@@ -114,83 +101,99 @@ class SuiteSettings(ExecutionOptions):
     performance: Literal["parts", "natural"] = "natural"
     """As for `headbench synth`; with `natural` each subject has another choreography."""
 
-    dynamics: float = 1.0
-    """As for `headbench synth`."""
-
-    tracking_error: float = 0.0
-    """As for `headbench synth`."""
-
-    tracker: Literal["per-frame", "video"] = "video"
-    """As for `headbench synth`."""
-
-    hair_lag: float = 0.0
-    """As for `headbench synth`."""
-
-    camera_colour: float = 0.0
-    """As for `headbench synth`."""
-
-    correctives: float = 0.0
+    dynamics: float = 2.0
     """As for `headbench synth`."""
 
     held_out_cameras: tuple[str, ...] = ()
-    """Cameras of the novel views, instead of the frontal one alone, for example `222200037 221501007 222200041`: the frontal one,
-    one at a side and a low one."""
+    """Cameras of the novel views; default: the frontal one, one at a side and a low one, or the frontal one alone if --cameras makes
+    too few."""
+
+    plan: tuple[str, ...] = ()
+    """Make nothing, and print the hours that the suite would take, and the differences that it would find. NAME=MICROSECONDS of
+    processor time: of an iteration of each method, of `capture`, a frame of a capture, and of `frame`, to render and measure a frame
+    of an avatar."""
 
     def __post_init__(self) -> None:
-        """Refuse invalid sizes and names."""
+        """Refuse invalid sizes and numbers."""
         parse_size(self.size)
-        for option in ("tracked", "equal_iterations"):
-            names = getattr(self, option)
-            if NONE in names and len(names) > 1:
-                where = f"--{option.replace('_', '-')}"
-                raise InputError("command line", where, f"names of methods, or {NONE}", " ".join(names))
-        for name, least in (("large", 0), ("repeated", 0), ("extremes", 0), ("first", 1)):
+        for name, least in (("repeated", 0), ("extremes", 0), ("first", 1)):
             if getattr(self, name) < least:
                 raise InputError("command line", f"--{name}", f"at least {least}", str(getattr(self, name)))
         if self.first > self.subjects:
             raise InputError(
                 "command line", "--first", f"at most --subjects, {self.subjects}", str(self.first)
             )
-        if any(not 0 < level <= 4 for level in self.levels):
-            raise InputError(
-                "command line", "--levels", "above 0 and at most 4", " ".join(map(str, self.levels))
-            )
+        iterations(self.iterations)
+        numbers(self.plan, "--plan")
 
     @staticmethod
     def notes() -> str:
         """Description of the presets in the help."""
         return presets_of_methods()
 
-    def tracked_of(self, methods: tuple[str, ...]) -> tuple[str, ...]:
-        """Names of the run's methods with the condition `TRACKED`."""
-        if self.tracked:
-            return tuple(name for name in self.tracked if name != NONE)
-        return tuple(name for name in TRACKED_METHODS if name in methods)
 
-
-OURS = "ours"
 REGIONS = ("face", "mouth", "eyes", "hair", "neck", "ears")
 """Regions of the frame with separate tables."""
 FACE_CROP = "lpips-face"
 """The metric that is measured besides those of every run."""
-OF_CAPTURES = (
-    *("subjects", "cameras", "timesteps", "performance", "dynamics", "tracking_error", "tracker"),
-    *("hair_lag", "camera_colour", "correctives"),
-)
+OF_CAPTURES = ("subjects", "cameras", "timesteps", "performance", "dynamics")
 """Settings of the suite that are those of `headbench synth`."""
 
 
 @command("run suite", group="compare", writes="out")
 def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandResult:
-    """Run the benchmark suite: ten synthetic subjects, all methods; takes hours.
+    """Run the benchmark suite: synthetic subjects, exact and as recordings are, all methods; takes hours.
 
-    Every subject has its own run, with conditions. Subjects run one after another, and the tables of ``results.md`` are written
-    after each. Images of twice the size have separate captures and runs, since means over subjects need equal sizes.
+    Every subject has two captures with a run each. Subjects run one after another, and the tables of ``results.md`` are written
+    after each.
     """
     from ...datasets.synthetic.capture import synthesize  # imports torch
     from ...reports.suite.suite import suite_report
 
     out, execution = Path(settings.out), settings.execution
+    runs = planned_runs(settings)
+    for config in runs.values():
+        check_settings(resolve_cells(config))
+        resolve_metrics(config)
+    check_executor(execution, runs[RUN].device)
+    if settings.plan:
+        return _plan(settings, runs)
+    failed: list[str] = []
+    ends: list[str] = []
+    done: list[Path] = []
+    for place in range(settings.first - 1, settings.subjects):
+        for base, config in runs.items():
+            if base == SEEDS_RUN and place >= settings.repeated:
+                continue
+            (capture,) = synthesize(
+                config.data,
+                only=place,
+                size=parse_size(settings.size),
+                seed=SEED,
+                **{name: getattr(settings, name) for name in OF_CAPTURES},
+                **(dict.fromkeys(RECORDED, 0.0) if base == RUN else RECORDED),
+                execution=execution,
+                progress=progress,
+            )
+            of_subject = replace(config, data=str(capture), out=str(Path(config.out) / f"{place + 1:02d}"))
+            rows = run(of_subject, execution).rows
+            done.append(Path(of_subject.out))
+            failed += rows.failed
+            trained = any(not method.spec.trivial for method in resolve_methods(config))
+            if base == RUN and trained and place < settings.extremes:
+                how = {name: getattr(settings, name) for name in ("executor", "workers", "set")}
+                extremes_run(ExtremesSettings(of_subject.out, **how), progress)
+            ends.append(closing(done[-1], rows))
+        write_text(out / "results.md", suite_report(out, OURS))
+    data = {"out": out, "runs": done, "failed": sorted({*failed})}
+    return CommandResult(
+        "\n\n".join([f"Tables of all results: {out / 'results.md'}", *ends]), data, not failed
+    )
+
+
+def planned_runs(settings: SuiteSettings) -> dict[str, RunConfig]:
+    """The configuration of each kind of run, for all subjects."""
+    out = Path(settings.out)
     methods = settings.methods or tuple(
         name for name, plugin in discover("methods").items() if plugin.spec and plugin.spec.demo
     )
@@ -203,50 +206,20 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
         regions=REGIONS,
         metrics=(*default_names("metrics"), FACE_CROP),
         reader_settings=_splits(settings),
+        settings=iterations(settings.iterations),
     )
-    coded = (PLAIN, *coded_conditions(methods))
-    config = replace(plain, conditions=(*coded, *_conditions(settings, plain)))
-    cells = resolve_cells(config)
-    resolve_metrics(config)
-    check_executor(execution, config.device)
-    check_settings(cells)
-    width, height = parse_size(settings.size)
-    large = replace(plain, data=str(out / "capture-large"), out=str(out / LARGE_RUN), conditions=coded)
-    seeds = tuple(max(settings.seeds) + further for further in (1, 2))
-    more_seeds = replace(plain, out=str(out / SEEDS_RUN), seeds=seeds, conditions=(PLAIN,))
-    failed: list[str] = []
-    ends: list[str] = []
-    runs: list[Path] = []
-    for place in range(settings.first - 1, settings.subjects):
-        parts = [(config, (width, height))]
-        if place < settings.repeated:
-            parts.append((more_seeds, (width, height)))
-        if place < settings.large:
-            parts.append((large, (2 * width, 2 * height)))
-        for planned, size in parts:
-            (capture,) = synthesize(
-                planned.data,
-                only=place,
-                size=size,
-                seed=SEED,
-                **{name: getattr(settings, name) for name in OF_CAPTURES},
-                execution=execution,
-                progress=progress,
-            )
-            of_subject = replace(planned, data=str(capture), out=str(Path(planned.out) / f"{place + 1:02d}"))
-            rows = run(of_subject, execution).rows
-            runs.append(Path(of_subject.out))
-            failed += rows.failed
-            trained = any(not method.spec.trivial for method, _ in cells)
-            if planned is config and trained and place < settings.extremes:
-                how = {name: getattr(settings, name) for name in ("executor", "workers", "set")}
-                extremes_run(ExtremesSettings(of_subject.out, **how), progress)
-            ends.append(closing(runs[-1], rows))
-            write_text(out / "results.md", suite_report(out, OURS))
-    data = {"out": out, "runs": runs, "failed": sorted({*failed})}
-    return CommandResult(
-        "\n\n".join([f"Tables of all results: {out / 'results.md'}", *ends]), data, not failed
-    )
+    specs = {method.spec.name: method.spec for method in resolve_methods(plain)}
+    ablations = _ablations(settings.ablations or (MOVED_LINES,) * (OURS in specs), specs)
+    recorded = replace(plain, data=str(out / "capture-recorded"), out=str(out / RECORDED_RUN))
+    runs = {
+        RUN: replace(plain, conditions=(PLAIN, *coded_conditions(methods), *ablations)),
+        RECORDED_RUN: replace(recorded, conditions=(PLAIN, *ablations)),
+    }
+    if settings.repeated:
+        again = {*SEEDS_METHODS} & {*specs} or {*specs}
+        seeds = replace(recorded, out=str(out / SEEDS_RUN), seeds=(max(settings.seeds) + 1,))
+        runs[SEEDS_RUN] = with_methods(seeds, again)
+    return runs
 
 
 def _splits(settings: SuiteSettings) -> dict[str, list[str]]:
@@ -254,10 +227,11 @@ def _splits(settings: SuiteSettings) -> dict[str, list[str]]:
     from ...datasets.synthetic.performance import HELD_OUT, share_out
     from ...datasets.synthetic.plan import serials
 
-    held_out = settings.held_out_cameras
+    known = serials(settings.cameras)
+    usual = HELD_OUT_CAMERAS if {*HELD_OUT_CAMERAS} < {*known} else ()
+    held_out = settings.held_out_cameras or usual
     if not held_out:
         return {}
-    known = serials(settings.cameras)
     if unknown := [name for name in held_out if name not in known]:
         expected = f"some of {', '.join(known)}, which --cameras {settings.cameras} makes"
         raise InputError("command line", "--held-out-cameras", expected, ", ".join(unknown))
@@ -270,49 +244,48 @@ def _splits(settings: SuiteSettings) -> dict[str, list[str]]:
     }
 
 
-def _conditions(settings: SuiteSettings, config: RunConfig) -> list[Condition]:
-    """All conditions except the plain comparison. Those without methods are omitted, since they would apply to all methods."""
-    resolved = resolve_methods(config)
-    specs = {method.spec.name: method.spec for method in resolved}
-    tracked = settings.tracked_of(tuple(specs))
-    converted = tuple(name for name, spec in specs.items() if spec.conversion == "published")
-    conditions = [
-        Condition(AS_TRACKED, converted, as_tracked=True),
-        Condition(TRACKED, tracked, clip=Named(TRACKED)),
+def _plan(settings: SuiteSettings, runs: Mapping[str, RunConfig]) -> CommandResult:
+    """Processor hours of captures, trainings and frames by kind of run, and the differences that the endpoints would show."""
+    from ...datasets.synthetic.performance import HELD_OUT, share_out
+    from ...reports.suite.suite import power_table
+    from ...reports.writers import pipe_table
+
+    sequences = share_out(settings.timesteps, settings.performance)
+    held_out = sum(n for name, n in sequences.items() if name.startswith(HELD_OUT))
+    novel = len(_splits(settings).get("held_out_cameras", [""])) * (settings.timesteps - held_out)
+    frames = novel + settings.cameras * held_out
+    microseconds = numbers(settings.plan, "--plan")
+    lines = [
+        ["run", "what", "subjects", "number for each", "processor hours"],
+        ["---", "---", "--:", "--:", "--:"],
     ]
-    conditions += [
-        Condition(LEVEL.format(level), tracked, clip=Named("tracking-error", {"level": level}))
-        for level in settings.levels
-    ]
-    iterations = {
-        method.spec.name: method.budget.iterations for method in resolved if not method.spec.trivial
-    }
-    if (count := iterations.get(EQUAL_TO)) is not None:
-        others = (OURS,) if iterations.get(OURS) not in (None, count) else ()
-        asked = settings.equal_iterations or others
-        names = tuple(name for name in asked if name != NONE)
-        conditions.append(Condition(EQUAL, names, {"budget": {"iterations": count}}))
-    conditions = [condition for condition in conditions if condition.methods]
-    estimated = [condition for condition in conditions if condition.clip and OURS in condition.methods]
-    ours = {name: spec for name, spec in specs.items() if name == OURS}
-    crossed = _ablations("--tracked-ablations", settings.tracked_ablations, ours)
-    if crossed and not estimated:
-        expected = f"{OURS} among those of --tracked, which --tracked-ablations are compared with"
-        raise InputError("command line", "--tracked", expected, " ".join(tracked) or NONE)
-    return [
-        *conditions,
-        *_ablations("--ablations", settings.ablations, specs),
-        *(
-            replace(ablation, name=f"{ablation.name}-{condition.name}", clip=condition.clip)
-            for ablation, condition in product(crossed, estimated)
-        ),
-    ]
+    total, needed = 0.0, {"capture", "frame"}
+    for base, config in runs.items():
+        subjects = settings.subjects - settings.first + 1
+        subjects = min(subjects, settings.repeated) if base == SEEDS_RUN else subjects
+        parts = {} if base == SEEDS_RUN else {"capture": settings.cameras * settings.timesteps}
+        cells = [cell for cell in resolve_cells(config) for _ in config.seeds]
+        for method, condition in cells:
+            if not (method.spec.trivial or condition.follows):
+                parts[method.spec.name] = parts.get(method.spec.name, 0) + (method.budget.iterations or 0)
+        parts["frame"] = len(cells) * frames
+        needed |= {*parts}
+        for name, count in parts.items():
+            hours = subjects * count * microseconds.get(name, 0) / 3.6e9
+            lines.append([base, name, str(subjects), str(count), f"{hours:.2f}"])
+            total += hours
+    if needed != {*microseconds}:
+        expected, found = (", ".join(sorted(names)) for names in (needed, microseconds))
+        raise InputError("command line", "--plan", f"microseconds of {expected}", found)
+    lines.append(["all", "", "", "", f"{total:.2f}"])
+    text = f"{pipe_table(lines)}\n\n{power_table(settings.subjects)}"
+    return CommandResult(text, {"processor_hours": total})
 
 
-def _ablations(option: str, asked: Sequence[str], specs: dict[str, MethodSpec]) -> list[Condition]:
+def _ablations(asked: Sequence[str], specs: Mapping[str, MethodSpec]) -> list[Condition]:
     """The requested ablations in the order of the methods' specs; the one of ours if several methods have the name."""
     if ALL in asked and OURS not in specs:
-        expected = f"{OURS} among them, whose {option} are all"
+        expected = f"{OURS} among them, whose --ablations are all"
         raise InputError("command line", "--methods", expected, ", ".join(specs))
     conditions: dict[str, Condition] = {}
     for spec in sorted(specs.values(), key=lambda spec: spec.name == OURS):
@@ -321,7 +294,7 @@ def _ablations(option: str, asked: Sequence[str], specs: dict[str, MethodSpec]) 
         }
     for name in asked:
         if name not in (*conditions, ALL):
-            raise InputError("command line", option, f"{', '.join(conditions)} or {ALL}", name)
+            raise InputError("command line", "--ablations", f"{', '.join(conditions)} or {ALL}", name)
     return [
         each
         for name, each in conditions.items()

@@ -22,15 +22,21 @@ from headbench.bench.errors import InputError
 from headbench.bench.experiments.extremes import RECORD_FILE
 from headbench.bench.io.files import write_json, write_text
 from headbench.bench.progress import counted
-from headbench.bench.protocol import TASK_TITLES, UNSEEN_CAMERAS
+from headbench.bench.protocol import UNSEEN_CAMERAS
 from headbench.bench.registry import get
 from headbench.bench.rows import FULL, Rows
 from headbench.reports.aggregate import coded_labels, summarise
 from headbench.reports.curve.curve import HELD_OUT, CurveData, leaders_text, read_curve
 from headbench.reports.protocols import choice_effects
 from headbench.reports.runs import FrameSelection, RunData, RunSet
-from headbench.reports.statistics.comparisons import PairedComparison, compare
-from headbench.reports.suite.suite import FOLDER, read_extremes, suite_report, suite_runs
+from headbench.reports.suite.suite import (
+    FOLDER,
+    comparison,
+    differences,
+    read_extremes,
+    suite_report,
+    suite_runs,
+)
 from headbench.reports.table_report import Columns, table_of
 from headbench.reports.tables import build_table
 from headbench.reports.writers import pipe_table, to_markdown, to_text
@@ -85,7 +91,7 @@ class StoredResults:
         folders = self.runs("further")
         same = self.read(*folders, *(self.gallery / "suite" / "run" / run.name for run in folders))
         further, new = same.only(same.ranked).shared.by_camera, self.run(folders[0]).methods
-        beside = f"{main_table(further)}\n\n{differences(further, new, REFERENCE)}"
+        beside = f"{main_table(further)}\n\n{psnr_differences(further, new, REFERENCE)}"
         columns = Columns(digits=("psnr=1", "ssim=3", "lpips=3"))
         printed = to_text(table_of(demo, columns=replace(columns, names=(NOVEL, "psnr", "ssim", "lpips"))))
         lines = [f"{OURS}+{name}" for name in get("methods", OURS).ablations]
@@ -96,7 +102,7 @@ class StoredResults:
             ("README.md", "suite"): main_table(self.ranked),
             ("README.md", "findings"): findings(self.suite, self.curve("seconds")),
             (f"{DOCS}/results.md", "demo"): to_markdown(table_of(demo, columns=columns)).strip(),
-            (f"{DOCS}/results.md", "differences"): differences(self.suite, BESIDE, REFERENCE),
+            (f"{DOCS}/results.md", "differences"): psnr_differences(self.suite, BESIDE, REFERENCE),
             (f"{DOCS}/results.md", "curves-seconds"): curve_table(self.curve("seconds"), 1),
             (f"{DOCS}/results.md", "curves-pictures"): curve_table(self.curve("pictures"), 2),
             (f"{DOCS}/protocols.md", "protocols"): choices(self.suite),
@@ -105,7 +111,7 @@ class StoredResults:
             (f"{DOCS}/metrics.md", "mechanisms"): mechanisms(
                 {folder.name: self.read(folder) for folder in self.runs("mechanisms")}
             ),
-            (f"{DOCS}/methods/ours.md", "ablations"): differences(self.suite, lines, OURS),
+            (f"{DOCS}/methods/ours.md", "ablations"): psnr_differences(self.suite, lines, OURS),
             (f"{DOCS}/methods/rgbavatar.md", "further"): beside,
         }
 
@@ -158,8 +164,8 @@ def main_table(runs: RunSet) -> str:
 def findings(suite: RunSet, curve: CurveData) -> str:
     """Three sentences on the suite's results."""
     trainings = [summarise(suite.rows, name, "training_processor", "").value for name in suite.ranked]
-    behind = difference(suite, REFERENCE, OURS, NOVEL, FACE)
-    without = difference(suite, f"{OURS}+no-lines", OURS, NOVEL, FACE)
+    behind = comparison(suite, (REFERENCE, OURS), NOVEL, "psnr", FACE)
+    without = comparison(suite, (f"{OURS}+no-lines", OURS), NOVEL, "psnr", FACE)
     values = {(point.method, point.budget.seconds): point.values["psnr_timesteps"] for point in curve.means}
     early, late = (values[REFERENCE, limit] - values[OURS, limit] for limit in (30, 120))
     assert min(behind.low, early, late) > 0 > without.low, "the sentences do not fit these rows"
@@ -173,25 +179,11 @@ def findings(suite: RunSet, curve: CurveData) -> str:
 {late:.1f} dB after 120 s ({len(curve.subjects)} subjects, whole frames)."""
 
 
-def difference(runs: RunSet, first: str, second: str, task: str, region: str = FULL) -> PairedComparison:
-    """PSNR of the first method minus that of the second, on the subjects that both have."""
-    pair = (first, second)
-    rows = runs.only(pair).shared.by_camera.of(FrameSelection(region)).rows
-    return compare(rows, [pair], task=task, metric="psnr", higher_is_better=True)[0]
-
-
-def differences(runs: RunSet, methods: Sequence[str], reference: str) -> str:
+def psnr_differences(runs: RunSet, methods: Sequence[str], reference: str) -> str:
     """Differences of the methods that the runs have from another, in whole frames and in the face."""
-    columns = [*product(runs.by_camera.tasks, (FULL, FACE))]
-    titles = [f"{TASK_TITLES[task]}{', face' * (region == FACE)}" for task, region in columns]
-    lines = [
-        [f"PSNR minus that of `{reference}`, dB", *titles, "subjects"],
-        ["---", *["--:"] * (1 + len(titles))],
-    ]
-    for name in (name for name in methods if name in runs.methods):
-        found = [difference(runs, name, reference, *column) for column in columns]
-        lines.append([f"`{name}`", *(each.text(2) for each in found), str(found[0].subjects)])
-    return pipe_table(lines)
+    columns = [(task, "psnr", region) for task, region in product(runs.by_camera.tasks, (FULL, FACE))]
+    known = [name for name in methods if name in runs.methods]
+    return differences(runs, known, reference, columns, f"PSNR minus that of `{reference}`, dB")
 
 
 def mechanisms(runs: Mapping[str, RunSet]) -> str:
@@ -233,9 +225,10 @@ def curve_table(curve: CurveData, place: int) -> str:
     amounts = sorted({point.place[place] for point in curve.means})
     lines = [[curve.over, *(f"{each:g}" for each in amounts), "MB"], ["---"] * (2 + len(amounts))]
     for method, points in groupby(curve.means, key=lambda point: point.method):
-        values = [point.values for point in points]
-        cells = [" / ".join(f"{own[f'psnr_{kind}']:.2f}" for kind in kinds) for own in values]
-        lines.append([f"`{method}`", *cells, f"{max(own['storage'] for own in values):.1f}"])
+        values = {point.place[place]: point.values for point in points}
+        cells = {n: " / ".join(f"{own[f'psnr_{kind}']:.2f}" for kind in kinds) for n, own in values.items()}
+        shown = [cells.get(n, "–") for n in amounts]
+        lines.append([f"`{method}`", *shown, f"{max(own['storage'] for own in values.values()):.1f}"])
     head = (
         f"PSNR in dB, held-out {' / '.join(kinds)}, means over subjects {', '.join(sorted(curve.subjects))}:"
     )

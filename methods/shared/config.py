@@ -191,8 +191,7 @@ def splat_presets(
 ) -> dict[str, dict[str, Any]]:
     """Presets of a mesh-bound method from its own settings for short and published runs, with budgets and splat settings.
 
-    ``fast`` is the number of iterations of that preset, in which all native methods take about the same processor time
-    (`docs/explanation/suite.md`).
+    ``fast`` is the number of iterations of that preset, in which all native methods take about the same processor time at 275x401.
     """
     return {
         "smoke": {"budget": {"iterations": 60}, **short, "splats": SHORT_SPLATS},

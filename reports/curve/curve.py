@@ -24,20 +24,31 @@ from ...bench.experiments.held_out import tracking_error
 from ...bench.experiments.specs import Over
 from ...bench.io.files import write_text
 from ...bench.manifest import ClipRecord, MethodRecord
+from ...bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from ...bench.rows import ALL, FULL, Rows
 from ...bench.specs import CommandResult, MetricSpec, command
 from ...bench.terminal import table
-from ..aggregate import subject_means
+from ..aggregate import QUALITY, subject_means
 from ..drawing import MARKERS, TEXT_POINTS, cost_axis, plot_file, show_missing, start_axes
-from ..runs import RunData
+from ..runs import SPLIT_TASK, RunData, unseen_cameras
 from ..statistics.comparisons import LEAST_SUBJECTS, half_width, interval
 from ..writers import csv_text, pipe_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-HELD_OUT: Mapping[str, str] = {"novel_view": "camera", "self_reenactment": "timesteps"}
-"""Held-out data by task."""
+HELD_OUT: Mapping[str, str] = {
+    "novel_view": "camera",
+    "self_reenactment": "timesteps",
+    SEEN_CAMERAS: "expressions_seen",
+    UNSEEN_CAMERAS: "expressions_unseen",
+}
+"""Held-out data by task; the last two are test frames, see `_by_camera`."""
+OF_FACE = "_face"
+"""Suffix of a metric over the face."""
+FACE = "face"
+GAIN = 0.05
+"""dB that twice the length of a training must gain at training cameras, or its curve has ended."""
 MEASURED: Mapping[str, tuple[str, float]] = {
     "processor_seconds": ("training_processor", 1.0),
     "seconds": ("training_time", 60.0),
@@ -111,6 +122,11 @@ def mean_point(points: Sequence[CurvePoint]) -> CurvePoint:
     )
 
 
+def held_out(task: str) -> str:
+    """Held-out data of a task in words."""
+    return HELD_OUT[task].replace("_", ", ")
+
+
 def column(spec: MetricSpec, task: str) -> str:
     """Name of a metric's value in `CurvePoint.values`."""
     return f"{spec.name}_{HELD_OUT[task]}" if task in HELD_OUT else spec.name
@@ -139,10 +155,10 @@ def points_text(curve: CurveData, failed: Sequence[str]) -> str:
             rows.append([*where, *(_text(point.values[column(spec, task)], spec.digits) for spec in frame)])
     lines = [table(heads, trainings, names=3, title="Trainings"), ""]
     for task, rows in quality.items():
-        title = f"Quality, held-out {HELD_OUT[task]}"
+        title = f"Quality, held-out {held_out(task)}"
         lines += [table([*place, *(spec.label for spec in frame)], rows, names=3, title=title), ""]
-    lines.append("Means over subjects. Held out of every training; no test frame was used:")
-    for subject in curve.subjects:
+    lines.append(f"Means over subjects. {curve.frames}")
+    for subject in curve.subjects if not curve.of_test else ():
         parameters = curve.held_out[subject]
         timesteps = parameters["timesteps"]
         steps = ", ".join([*map(str, timesteps[:6]), *(["..."] if len(timesteps) > 6 else [])])
@@ -167,6 +183,8 @@ class CurveReportSettings:
     """Folder to write: curve.csv and curve.png."""
     over: Over = "budget"
     """What the trainings differ in, as for `headbench run curve`."""
+    methods: tuple[str, ...] = ()
+    """Only these methods, for example two, to see where their curves cross; default: all."""
 
     def __post_init__(self) -> None:
         if not self.runs:
@@ -302,22 +320,56 @@ AXES = {
 }
 
 
-def curve_report(out: Path, over: str) -> CommandResult:
-    """Write ``curve.csv`` and ``curve.png`` of the run in ``out``; see `joined_curve`."""
-    return joined_curve([RunData.read(out)], over, out)
+def curve_report(parts: Sequence[Path], over: str, out: Path) -> CommandResult:
+    """Write ``curve.csv`` and ``curve.png`` of runs of one curve; see `joined_curve`."""
+    return joined_curve([RunData.read(part) for part in parts], over, out)
 
 
 @command("report curve", group="inspect", writes="out")
 def curve_runs(settings: CurveReportSettings, progress: Progress = no_progress) -> CommandResult:
     """Join runs of `headbench run curve`: means over subjects, and the best method for each cost of a
     training."""
-    runs = [RunData.read(Path(run)) for run in settings.runs]
-    return joined_curve(runs, settings.over, Path(settings.out))
+    runs = [RunData.read(path) for run in settings.runs for path in _parts(Path(run))]
+    return joined_curve(runs, settings.over, Path(settings.out), settings.methods)
 
 
-def joined_curve(runs: Sequence[RunData], over: str, out: Path) -> CommandResult:
+def _parts(curve: Path) -> list[Path]:
+    """The runs of a curve: its folder, or those in the folder of one with ``--until-flat``."""
+    inside = sorted(file.parent for file in curve.glob("*/run.json"))
+    return [curve] if (curve / "run.json").is_file() or not inside else inside
+
+
+def rising(parts: Sequence[Path], over: str) -> set[str]:
+    """Methods whose curve has not ended at its last training, see `ended`."""
+    curve = read_curve([RunData.read(part) for part in parts], over)
+    points: dict[str, list[CurvePoint]] = {}
+    for point in curve.means:
+        points.setdefault(point.method, []).append(point)
+    psnr = next(name for name in ("psnr_face", "psnr") if any(spec.name == name for spec in curve.metrics))
+    seen = HELD_OUT[next(task for task in curve.tasks if task != "novel_view")]
+    return {name for name, own in points.items() if not ended(own, f"{psnr}_{seen}", f"{psnr}_camera")}
+
+
+def ended(points: Sequence[CurvePoint], seen: str, unseen: str) -> bool:
+    """Whether the last of a method's points, by length, gains less than `GAIN` for twice the length, or is worse at the other
+    cameras."""
+    if len(points) < 2:
+        return False
+    before, last = points[-2:]
+    values = [(point.values[seen], point.values.get(unseen)) for point in (before, last)]
+    (seen_before, unseen_before), (seen_last, unseen_last) = values
+    if seen_before is None or seen_last is None:
+        return True  # a training failed
+    lengths = [point.budget.iterations or point.budget.seconds or 1.0 for point in (before, last)]
+    gain = (seen_last - seen_before) / math.log2(lengths[1] / lengths[0])
+    return gain < GAIN or (
+        unseen_before is not None and unseen_last is not None and unseen_last < unseen_before
+    )
+
+
+def joined_curve(runs: Sequence[RunData], over: str, out: Path, methods: Sequence[str] = ()) -> CommandResult:
     """Write ``curve.csv`` and ``curve.png`` of runs; return points, a table of their means, and the best method by cost."""
-    curve = read_curve(runs, over)
+    curve = read_curve(runs, over, methods)
     out.mkdir(parents=True, exist_ok=True)
     records = [point.flat() for point in curve.points]
     write_text(out / "curve.csv", csv_text([[*records[0]], *([*record.values()] for record in records)]))
@@ -352,9 +404,21 @@ class CurveData:
     tasks: Sequence[str]
     clock: str  # the cost in `MEASURED` that measures training time on the device
     best: Mapping[tuple[str, str], Sequence[Leader]]  # by name of a frame metric and task
-    every: int  # one of this many consecutive training timesteps is held out
+    every: int  # one of this many consecutive training timesteps is held out; 0 if test frames were scored
     held_out: Mapping[str, Mapping[str, Any]]  # camera and timesteps, and remaining training data, by subject
     missing: Mapping[str, str]  # reasons by label of a metric that was not measured
+
+    @property
+    def of_test(self) -> bool:
+        """Whether the test frames of the captures were scored."""
+        return not self.every
+
+    @property
+    def frames(self) -> str:
+        """What was scored, in words."""
+        if self.of_test:
+            return "Test frames of the captures."
+        return "Held out of every training; no test frame was used:"
 
     @property
     def of_frames(self) -> list[MetricSpec]:
@@ -368,11 +432,16 @@ class CurveData:
         return measured if self.over in TIMED else AXES[self.over]
 
 
-def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
-    """Read the trainings of runs of the same kind of curve, which differ in the quantity ``over``."""
+def read_curve(runs: Sequence[RunData], over: str, methods: Sequence[str] = ()) -> CurveData:
+    """Read the trainings of runs of the same kind of curve, which differ in the quantity ``over``; of some methods if named."""
+    runs = [_by_camera(run) for run in runs]
     points = [point for run in runs for point in _points(run, over)]
+    for name in methods:
+        if name not in (known := list(dict.fromkeys(point.method for point in points))):
+            raise InputError("command line", "--methods", f"methods of the runs: {', '.join(known)}", name)
+    points = [point for point in points if not methods or point.method in methods]
     _check_together(runs, points)
-    tasks, metrics = runs[0].tasks, runs[0].manifest.metrics
+    tasks, metrics = runs[0].tasks, _metrics(runs[0])
     names = list(dict.fromkeys(point.method for point in points))
     order = list(dict.fromkeys(point.subject for point in points))
     trained = {(point.method, point.subject) for point in points}
@@ -389,17 +458,17 @@ def read_curve(runs: Sequence[RunData], over: str) -> CurveData:
         over,
         shared,
         points,
-        [mean_point(group) for group in groups.values()],
+        [mean_point(group) for group in groups.values() if len(group) == len(shared)],
         metrics,
         tasks,
         clock,
         _leaders(points, metrics, tasks, {"budget": clock, "seconds": LIMIT}.get(over, over)),
-        runs[0].manifest.configuration.clip.parameters["every"],
+        0 if _of_test(runs[0]) else runs[0].manifest.configuration.clip.parameters["every"],
         {clip.subject: _step(clip.steps, "hold_out") for run in runs for clip in run.manifest.clips},
         {
             spec.label: reason
             for run in runs
-            for spec in metrics
+            for spec in run.manifest.metrics
             if spec.per_frame and (reason := _reason(run.rows, spec))
         },
     )
@@ -413,14 +482,46 @@ def write_curve(path: Path, curve: CurveData) -> None:
         "novel_view": "a training camera",
         "self_reenactment": f"one of {curve.every} consecutive training timesteps",
     }
-    held = " and ".join(left_out[task] for task in curve.tasks)
-    note = f"Held out of every training: {held}. No test frame was used."
+    note = curve.frames
+    if not curve.of_test:
+        held = " and ".join(left_out[task] for task in curve.tasks)
+        note = f"Held out of every training: {held}. No test frame was used."
     count = len(curve.subjects)
     if count >= LEAST_SUBJECTS:
         note += f" Bars: 95 % intervals of the mean over {count} subjects."
     elif count > 1:
         note += f" Means over {count} subjects, which are too few for intervals."
     write_plot(path, rows, curve.axis, note)
+
+
+def _of_test(run: RunData) -> bool:
+    """Whether a curve was measured on the test frames of its captures."""
+    return bool(run.manifest.configuration.clip.parameters.get("test"))
+
+
+def _by_camera(run: RunData) -> RunData:
+    """The run with self-reenactment of test frames split by whether their cameras have training frames, if both exist."""
+    unseen, _ = unseen_cameras([run.manifest], run.keys(SPLIT_TASK))
+    if not _of_test(run) or not unseen:
+        return run
+    protocols = dict(run.manifest.protocols)
+    whole = protocols.pop(SPLIT_TASK)
+    for task, chosen in ((SEEN_CAMERAS, False), (UNSEEN_CAMERAS, True)):
+        keys = tuple(key for key in whole.keys if ((key.subject, key.camera) in unseen) == chosen)
+        protocols[task] = replace(whole, keys=keys)
+    rows = run.rows.split_by_camera(SPLIT_TASK, unseen, UNSEEN_CAMERAS, SEEN_CAMERAS)
+    return replace(run, manifest=replace(run.manifest, protocols=protocols), rows=rows)
+
+
+def _metrics(run: RunData) -> tuple[MetricSpec, ...]:
+    """The run's metrics, and PSNR of the face if it was measured."""
+    of_face = run.rows.of_part(FACE, (), FULL).metrics if FACE in run.rows.regions else set()
+    specs = []
+    for spec in run.manifest.metrics:
+        specs.append(spec)
+        if spec.name == QUALITY and spec.name in of_face:
+            specs.append(replace(spec, name=spec.name + OF_FACE, label=f"{spec.label} of the face"))
+    return tuple(specs)
 
 
 def _points(run: RunData, over: str) -> list[CurvePoint]:
@@ -506,7 +607,7 @@ def _leaders(
 
 def leaders_text(curve: CurveData, *, markdown: bool = True) -> str:
     """The best methods by metric and held-out data, in a sentence and a table: Markdown, or for a terminal."""
-    heads = [f"held-out {HELD_OUT[task]}" for task in curve.tasks]
+    heads = [f"held-out {held_out(task)}" for task in curve.tasks]
     lines = []
     for spec in curve.of_frames:
         cells = ("; ".join(leader.text() for leader in curve.best[spec.name, task]) for task in curve.tasks)
@@ -525,10 +626,11 @@ def leaders_text(curve: CurveData, *, markdown: bool = True) -> str:
 
 def _point(run: RunData, record: MethodRecord, condition: Condition, clip: ClipRecord) -> CurvePoint:
     values: dict[str, float | None] = {}
-    for spec in run.manifest.metrics:
+    for spec in _metrics(run):
+        name, region = spec.name.removesuffix(OF_FACE), FACE if spec.name.endswith(OF_FACE) else FULL
         for task in run.tasks if spec.per_frame else ("",):
             chosen = run.rows.select(
-                method=record.label, metric=spec.name, task=task, region=FULL, seeds=ALL, subject=clip.subject
+                method=record.label, metric=name, task=task, region=region, seeds=ALL, subject=clip.subject
             )
             whole = len(chosen) and (chosen["status"] == "ok").all()
             values[column(spec, task)] = subject_means(chosen)[clip.subject] if whole else None
@@ -575,5 +677,5 @@ def _panel(curve: CurveData, spec: MetricSpec, task: str, axis: str) -> CurvePan
             cost = max(cost, 1e-3) if axis in point.cost else cost  # times are recorded in whole milliseconds
             line.append((cost, value, half or 0.0))
     unit = f", {spec.unit}" if spec.unit else ""
-    title = f"{spec.label}{unit}, held-out {HELD_OUT[task]}"
+    title = f"{spec.label}{unit}, held-out {held_out(task)}"
     return CurvePanel(title, lines, curve.missing.get(spec.label, ""))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ import tyro
 from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.files import check_output_folder, write_text
+from ...bench.rows import FULL
 from ...bench.specs import CommandResult, MetricSpec, command
 from ...bench.terminal import table
 from ..aggregate import LATENCY, SPEED, STORAGE, Conditions, conditions, note_of, pareto_front, summarise
@@ -127,6 +128,8 @@ class ParetoSettings:
     """Metric of quality; default: the first of frames that the runs have."""
     time: str = ""
     """Metric of frame time, in ms: latency_p50 (default, or 1 / frames per second), processor_time, ..."""
+    region: str = "full"
+    """Region of the frames that gives the quality, such as face."""
 
     def __post_init__(self) -> None:
         if not self.runs:
@@ -136,16 +139,31 @@ class ParetoSettings:
 COSTS = {"megabytes": "Size, MB", "milliseconds": "Frame time, ms"}
 
 
+def _of_region(data: RunData, region: str) -> RunData:
+    """A run with the values of a region instead of whole frames."""
+    if region not in data.rows.regions:
+        known = ", ".join(sorted(data.rows.regions))
+        raise InputError(data.folder.rows, "region", f"one of {known}", region)
+    return replace(data, rows=data.rows.of_part(region, (), FULL))
+
+
 @command("report pareto", group="inspect", writes="out")
 def pareto_runs(settings: ParetoSettings, progress: Progress = no_progress) -> CommandResult:
     """Plot quality against size and frame time of runs, with the Pareto front."""
-    return pareto(settings.runs, Path(settings.out), settings.task, settings.metric, settings.time)
+    chosen = settings.task, settings.metric, settings.time, settings.region
+    return pareto(settings.runs, Path(settings.out), *chosen)
 
 
-def pareto(runs: Sequence[str], out: Path, task: str, metric_name: str = "", time: str = "") -> CommandResult:
+def pareto(
+    runs: Sequence[str], out: Path, task: str, metric_name: str = "", time: str = "", region: str = FULL
+) -> CommandResult:
     """Write ``points.csv`` and ``pareto.png`` of finished runs; those of different subjects are joined."""
     read = joined_subjects([RunData.read(Path(run)) for run in runs])
+    if region != FULL:
+        read = [_of_region(data, region) for data in read]
     points, left_out, metric, note = read_points(read, task, metric_name, time)
+    if region != FULL:
+        metric = replace(metric, label=f"{metric.label} of the {region}")
     check_output_folder(out)
     rising = metric.higher_is_better
     fronts = {cost: front_of(points, cost, higher_is_better=rising) for cost in COSTS}

@@ -124,6 +124,26 @@ def _frames(rows: pd.DataFrame) -> pd.Index[Any]:
     return table.index
 
 
+def paired_power(effect: float, subjects: int, level: float = LEVEL) -> float:
+    """Power of the two-sided paired t-test for a mean difference of ``effect`` standard deviations (Cohen's d_z) over subjects.
+
+    ``level`` divided by the number of tests is that of the first step of Holm's procedure: a lower bound of the power of each.
+    """
+    from scipy.special import ncfdtr
+    from scipy.stats import f as fisher
+
+    # The square of the test's t has a noncentral F distribution.
+    freedom = subjects - 1
+    return 1.0 - float(ncfdtr(1, freedom, subjects * effect**2, fisher.ppf(1 - level, 1, freedom)))
+
+
+def detectable(subjects: int, level: float = LEVEL, power: float = 0.8) -> float:
+    """Smallest effect, in standard deviations over subjects, that `paired_power` finds with a power."""
+    from scipy.optimize import brentq
+
+    return float(brentq(lambda effect: paired_power(effect, subjects, level) - power, 0.0, 20.0))
+
+
 def half_width(values: Sequence[float], level: float = LEVEL) -> float:
     """Half the width of the interval of the mean of at least two numbers by Student's t, with confidence 1 - ``level``.
 

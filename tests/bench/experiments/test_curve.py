@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -218,6 +219,52 @@ def test_the_held_out_camera_and_timesteps_can_be_chosen(make_run, plugin):
     assert {(key.timestep, key.camera) for key in train} == {(t, c) for t in (0, 2) for c in "013"}
     with pytest.raises(InputError, match="parameters.camera, .* choose another --out"):
         curve_run(settings(run, fractions=("1",)))
+
+
+def test_test_frames_are_scored_by_camera_where_asked_for(make_run, plugin):
+    findings = curve_run(settings(make_run("curve_plugin:METHOD"), fractions=("1",), test=True))
+    ((train, _),) = plugin.FITS
+    assert {(key.timestep, key.camera) for key in train} == {(t, c) for t in range(4) for c in "0134"}
+    assert set(plugin.RENDERED) == {(t, "2") for t in range(4)} | {(t, c) for t in (4, 5) for c in "01234"}
+    (point,) = findings.data["points"]
+    seen, unseen = (point[f"psnr_expressions_{name}"] for name in ("seen", "unseen"))
+    assert seen == pytest.approx(unseen)  # a ball frame is as bright in all cameras
+    assert "Test frames of the captures." in findings.text
+
+
+def test_the_face_is_measured_where_captures_have_it(make_run, monkeypatch):
+    ball = importlib.import_module("ball_plugin")
+    masks = {"face": np.arange(ball.SIZE[0] * ball.SIZE[1]).reshape(ball.SIZE[::-1]) > 60}
+    monkeypatch.setattr(ball.BallClip, "region_names", ("face",), raising=False)
+    monkeypatch.setattr(ball.BallClip, "region_masks", lambda clip, key, names: masks, raising=False)
+    (point,) = curve_run(settings(make_run("curve_plugin:METHOD"), fractions=("1",))).data["points"]
+    assert point["psnr_face_camera"] == pytest.approx(point["psnr_camera"])  # grey on grey
+    assert point["psnr_face_timesteps"] == pytest.approx(point["psnr_timesteps"])
+
+
+def test_parts_may_be_of_another_number_of_iterations(make_run, plugin):
+    run = make_run("curve_plugin:METHOD")
+    curve_run(settings(run, fractions=("1/4", "1"), iterations=("noting=400",)))
+    assert [budget for _, budget in plugin.FITS] == [Budget(400), Budget(100)]
+    with pytest.raises(InputError, match="NAME=NUMBER"):
+        settings(run, iterations=("noting",))
+
+
+@pytest.mark.parametrize("over", ["budget", "seconds"])
+def test_a_curve_ends_where_a_longer_training_is_worse(make_run, plugin, over):
+    """Renders get brighter with the length, and all frames are dark."""
+    run = make_run("curve_plugin:METHOD")
+    lengths = {"fractions": ("1/16", "1/4", "1")} if over == "budget" else {"seconds": (4.0, 16.0, 64.0)}
+    asked = settings(run, over=over, until_flat=True, **lengths)
+    findings = curve_run(asked)
+    assert [budget.iterations or budget.seconds for _, budget in plugin.FITS] == [4, 16]
+    assert len(findings.data["points"]) == 2
+    curve_run(asked)
+    assert len(plugin.FITS) == 2
+    joined = curve_runs(CurveReportSettings((str(findings.data["out"]),), str(run / "joined"), over))
+    assert [p["psnr_camera"] for p in joined.data["points"]] == [
+        p["psnr_camera"] for p in findings.data["points"]
+    ]
 
 
 def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):

@@ -9,7 +9,15 @@ from scipy.stats import t as student_t
 from headbench.bench.contracts import Budget
 from headbench.bench.io.images import read_png
 from headbench.reports.curve import curve
-from headbench.reports.curve.curve import CurvePanel, CurvePoint, Leader, leaders, mean_point, write_plot
+from headbench.reports.curve.curve import (
+    CurvePanel,
+    CurvePoint,
+    Leader,
+    ended,
+    leaders,
+    mean_point,
+    write_plot,
+)
 
 COSTS = np.geomspace(4.0, 64.0, 3)
 
@@ -108,6 +116,26 @@ def test_a_mean_has_an_interval_from_three_subjects(values, mean, half):
     found = mean_point(points)
     assert (found.values["psnr"], found.cost["megabytes"]) == (mean, 2.0)
     assert found.halves["psnr"] == (None if half is None else pytest.approx(half))
+
+
+@pytest.mark.parametrize(
+    ("lengths", "seen", "unseen", "end"),
+    [
+        ([10], [20.0], [20.0], False),
+        ([10, 20], [20.0, 20.06], [20.0, 20.0], False),
+        ([10, 20], [20.0, 20.04], [20.0, 20.1], True),
+        ([10, 40], [20.0, 20.09], [20.0, 20.1], True),  # 0.045 dB for twice the length
+        ([10, 20], [20.0, 21.0], [20.0, 19.9], True),
+        ([10, 20], [20.0, 21.0], [None, None], False),
+        ([10, 20], [20.0, None], [20.0, 20.1], True),
+    ],
+)
+def test_a_curve_ends_at_its_gain_or_at_its_maximum(lengths, seen, unseen, end):
+    points = [
+        CurvePoint("a", "s", (n,), Fraction(1), Budget(n), 3, 4, 12, None, {}, {"seen": s, "unseen": u}, {})
+        for n, s, u in zip(lengths, seen, unseen)
+    ]
+    assert ended(points, "seen", "unseen") == end
 
 
 @pytest.mark.parametrize(

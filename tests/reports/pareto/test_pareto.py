@@ -117,6 +117,17 @@ def test_a_metric_where_less_is_better_turns_the_front_round(make_run, tmp_path)
 
 
 @pytest.mark.usefixtures("no_plots")
+def test_quality_may_be_that_of_a_region(make_run, tmp_path):
+    run = make_run("run", ours=(28.0, 0.10, 1.0, 200.0))
+    found = pareto_runs(ParetoSettings((run,), str(tmp_path / "out"), region="face"))
+    (point,) = found.data["points"]
+    assert (point["quality"], point["megabytes"]) == (18.0, 1.0)
+    assert "PSNR of the face" in found.text
+    with pytest.raises(InputError, match="one of face, full"):
+        pareto_runs(ParetoSettings((run,), str(tmp_path / "out"), region="hat"))
+
+
+@pytest.mark.usefixtures("no_plots")
 def test_what_does_not_compare_or_is_not_there_is_refused(make_run, tmp_path):
     one = make_run("one", ours=(28.0, 0.1, 1.0, 200.0))
     other = make_run("other", protocol="p2", ours=(28.0, 0.1, 1.0, 200.0))

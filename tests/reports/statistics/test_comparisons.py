@@ -12,12 +12,14 @@ from headbench.bench.rows import Rows
 from headbench.reports.statistics import comparisons
 from headbench.reports.statistics.comparisons import (
     best_set,
+    detectable,
     equivalence_p,
     half_width,
     holm,
     interval,
     least_p,
     paired_differences,
+    paired_power,
     sign_flip_p,
     subjects_needed,
 )
@@ -329,3 +331,20 @@ def test_half_width_by_the_printed_table_of_student():
     # t(0.975, 3) = 3.182, t(0.95, 3) = 2.353; the standard deviation of 0, 0, 0, 2 is 1.
     assert half_width([0.0, 0.0, 0.0, 2.0]) == pytest.approx(3.182 / 2, abs=5e-4)
     assert half_width([0.0, 0.0, 0.0, 2.0], 0.1) == pytest.approx(2.353 / 2, abs=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("effect", "subjects", "level", "power"),
+    [
+        (0.5, 34, 0.05, 0.8078),  # G*Power 3.1, two-sided t test of matched pairs
+        (0.0, 10, 0.01, 0.01),
+        (50.0, 6, 0.01, 1.0),
+    ],
+)
+def test_power_is_that_of_the_paired_t_test(effect, subjects, level, power):
+    assert paired_power(effect, subjects, level) == pytest.approx(power, abs=1e-4)
+
+
+def test_the_detectable_effect_is_found_as_often_as_asked():
+    values = np.random.default_rng(0).normal(detectable(10, 0.01, 0.7), 1.0, (20_000, 10))
+    assert (stats.ttest_1samp(values, 0.0, axis=1).pvalue < 0.01).mean() == pytest.approx(0.7, abs=0.01)

@@ -1,7 +1,8 @@
-"""The variance between and within subjects, against drawn numbers of known deviations and a small example."""
+"""The endpoints and tables of a suite, and the variance between and within subjects, against small examples and scipy."""
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,102 +11,134 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from headbench.bench.condition import PLAIN, Condition
 from headbench.bench.engine.store import RunFolder
+from headbench.bench.experiments.specs import MOVED_LINES
 from headbench.bench.manifest import MethodRecord
 from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS
 from headbench.bench.rows import Rows
 from headbench.reports.runs import RunSet
-from headbench.reports.statistics.comparisons import PairedComparison
 from headbench.reports.suite import suite as primary
 from headbench.reports.suite.suite import (
-    CROSSED,
-    ENDPOINTS,
-    LARGE,
-    MARGINS,
-    PAIR,
     PRIMARY,
-    _cell,
-    ablation_table,
+    SECTIONS,
     components,
-    condition_table,
-    drop_table,
     extremes_section,
+    power_table,
     primary_comparisons,
     primary_section,
     read_extremes,
     suite_report,
     variance_section,
 )
-from headbench.reports.table_report import table_of
 
 from ..conftest import LPIPS, PSNR
 from ..made_rows import row
 
 PAGE = Path(__file__).parents[3] / "docs" / "explanation" / "suite.md"
-TASKS = tuple(dict.fromkeys(task for task, _ in PRIMARY))
+TASKS = ("novel_view", SEEN_CAMERAS, UNSEEN_CAMERAS)
+MOVED = f"ours+{MOVED_LINES}"
+LEVELS = {"ga": 30.0, "ours": 30.2, MOVED: 30.3, "gbs": 20.0}
+CROP = replace(LPIPS, name="lpips-face", label="LPIPS face", kind="face")
 
 
 def test_the_documentation_lists_the_same_endpoints():
-    section = PAGE.read_text(encoding="utf-8").split("## Primary endpoints")[1].split("\n## ")[0]
-    assert tuple(re.findall(r"^\| `(\w+)` \| `(\w+)` \|$", section, re.MULTILINE)) == PRIMARY
-    assert "`{}` against `{}`".format(*PAIR) in section
-    assert f"equivalence within {MARGINS['psnr']:g} dB" in section
-    assert [*MARGINS] == ["psnr"]
+    section = PAGE.read_text(encoding="utf-8").split("## Endpoints")[1].split("\n## ")[0]
+    listed = re.findall(
+        r"^\| `(\S+)` - `(\S+)` \| `(\S+)`(?: minus `(\S+)`)? \| `(\S+)` ", section, re.MULTILINE
+    )
+    assert listed == [(*each.pair, each.task, each.minus, each.metric) for each in PRIMARY]
 
 
 @pytest.fixture
 def runs():
-    """Runs of ten subjects; ours ahead of ga by 0.2 dB, other in each task and metric, a third method far behind."""
+    """Runs of ten subjects at `LEVELS`, other in each task, metric and region."""
     generator = np.random.default_rng(0)
-    rows = [
-        row(method, metric, level + generator.normal(0, 0.1), f"s{s}", task=task)
-        for method, level in (("ga", 30.0), ("ours", 30.2), ("gbs", 20.0))
-        for task, metric in PRIMARY
-        for s in range(10)
+    records, rows = {}, []
+    for label, level in LEVELS.items():
+        method, _, condition = label.partition("+")
+        records[label] = MethodRecord(method, "1", "m:M", False, None, {}, condition=condition)
+        for task in TASKS:
+            for metric, region in (
+                ("psnr", "full"),
+                ("psnr", "face"),
+                ("lpips", "full"),
+                ("lpips-face", "full"),
+            ):
+                values = level + generator.normal(0, 0.1, 10)
+                rows += [
+                    row(label, metric, v, f"s{n}", task=task, region=region) for n, v in enumerate(values)
+                ]
+    specs = (replace(PSNR, kind="regional"), LPIPS, CROP)
+    run = SimpleNamespace(folder=RunFolder(Path("run")), manifest=SimpleNamespace(clips=[]))
+    return RunSet((run,), Rows.of(rows), specs, TASKS, records, (), {}, {})
+
+
+def differences(runs, first, second, task, metric, region="full"):
+    means = [
+        runs.rows.select(method=name, metric=metric, task=task, region=region, seeds=(0,))
+        .set_index("subject")["value"]
+        .sort_index()
+        for name in (first, second)
     ]
-    records = {name: MethodRecord(name, "1", "m:M", False, None, {}) for name in ("ga", "ours", "gbs")}
-    return RunSet((), Rows.of(rows), (PSNR, LPIPS), TASKS, records, (), {}, {})
+    return (means[0] - means[1]).to_numpy()
 
 
 def test_all_endpoints_are_one_family(runs):
     found = primary_comparisons(runs)
-    assert [(c.task, c.metric) for c in found] == [*PRIMARY]
-    assert {(c.first, c.second, c.family) for c in found} == {(*PAIR, len(PRIMARY))}
+    values = [
+        differences(runs, "ours", "ga", "novel_view", "psnr", "face"),
+        differences(runs, "ours", "ga", "novel_view", "lpips-face"),
+        differences(runs, "ours", "ga", UNSEEN_CAMERAS, "psnr", "face"),
+        differences(runs, "ours", "ga", UNSEEN_CAMERAS, "lpips-face"),
+        differences(runs, MOVED, "ours", "novel_view", "psnr", "face")
+        - differences(runs, MOVED, "ours", UNSEEN_CAMERAS, "psnr", "face"),
+    ]
+    assert [c.difference for c in found] == pytest.approx([each.mean() for each in values])
     options = {"permutation_type": "samples", "n_resamples": np.inf, "vectorized": True}
-    values = [[v for _, v in c.differences] for c in found]
     expected = np.array([stats.permutation_test((v,), np.mean, **options).pvalue for v in values])
     # Holm's procedure as a sequence of rejections, at the smallest level that rejects each hypothesis.
     order = expected.argsort()
     adjusted = {
-        i: max((6 - k) * expected[j] for k, j in enumerate(order[: n + 1])) for n, i in enumerate(order)
+        i: max((5 - k) * expected[j] for k, j in enumerate(order[: n + 1])) for n, i in enumerate(order)
     }
-    assert [c.p_holm for c in found] == pytest.approx([min(1.0, adjusted[i]) for i in range(6)])
-    assert [c.margin for c in found] == [MARGINS.get(metric) for _, metric in PRIMARY]
-    assert [c.equivalent is None for c in found] == [metric not in MARGINS for _, metric in PRIMARY]
+    assert [c.p_holm for c in found] == pytest.approx([min(1.0, adjusted[i]) for i in range(5)])
+    assert {c.family for c in found} == {5}
 
 
-def test_the_section_shows_each_endpoint_with_its_test(runs):
-    text = primary_section(runs)
-    lines = [line for line in text.splitlines() if line.startswith("|")][2:]
-    assert len(lines) == len(PRIMARY)
-    assert lines[0].startswith("| Novel view, PSNR (dB) | +0.")
-    assert sum("within 0.3 dB" in line for line in lines) == 3
-    assert "exploratory" in text
+def test_the_section_has_one_verdict_for_each_endpoint(runs):
+    text = primary_section(runs, runs)
+    tables = [
+        [line for line in part.splitlines() if line.startswith("|")][2:] for part in text.split("elsewhere")
+    ]
+    assert [len(lines) for lines in tables] == [len(PRIMARY)] * 2
+    assert tables[0][0].startswith("| `ours` - `ga`: novel view, PSNR of the face (dB) | +0.")
+    assert "novel view minus self-reenactment at unseen cameras" in tables[0][-1]
+    assert sum("is better" in line or "differ" in line for line in tables[0]) == len(PRIMARY)
+    crop, whole = (
+        differences(runs, "ours", "ga", "novel_view", metric).mean() for metric in ("lpips-face", "lpips")
+    )
+    assert [f"{each:+.4f}" in tables[1][1] for each in (crop, whole)] == [True, True]
+    assert not any("is better" in line for line in tables[1])
 
 
-def test_runs_without_the_pair_have_no_primary_endpoint(runs):
-    other = runs.only(["ours", "gbs"])
-    assert primary_comparisons(other) == []
-    assert "primary endpoints compare `ours` with `ga`" in primary_section(other)
+def test_runs_without_an_endpoint_have_no_verdict(runs):
+    for other in (None, runs.only(["ours", "ga"]), replace(runs, metrics=runs.metrics[:2])):
+        text = primary_section(other, runs)
+        assert "These runs lack" in text
+        assert "Holm" not in text
+
+
+def test_the_power_table_scales_with_the_assumed_deviation():
+    cells = [line.split(" | ") for line in power_table(10).splitlines()[2:]]
+    assert [line[-1] for line in cells] == ["1.23 |", "1.33 SD |", "1.03 |", "1.33 SD |", "0.67 |"]
 
 
 @pytest.mark.parametrize(("planned", "interim"), [(0, 0), (10, 0), (12, len(PRIMARY))])
 def test_there_is_no_verdict_before_all_subjects_are_measured(runs, monkeypatch, planned, interim):
     monkeypatch.setattr(primary, "planned_subjects", lambda runs: planned)
-    text = primary_section(runs)
+    text = primary_section(runs, None)
     assert text.count("interim: 10 of 12 subjects") == interim
-    assert ("is better" in text or "no significant difference" in text) == (not interim)
+    assert ("is better" in text or "the differences differ" in text) == (not interim)
 
 
 def test_planned_subjects_are_those_of_the_captures():
@@ -115,162 +148,36 @@ def test_planned_subjects_are_those_of_the_captures():
     assert primary.planned_subjects(SimpleNamespace(runs=())) == 0
 
 
-def test_rows_are_ablations_and_cells_their_differences(make_run):
-    both = ("toy_plugin:MIRROR", "toy_plugin:METHOD")
-    conditions = (PLAIN, Condition("less", ("toy",), {"level": 0.5}))
-    runs = RunSet.read(
-        [make_run("run", methods=both, settings={"toy": {"level": 0.25}}, conditions=conditions)]
-    )
-    table = ablation_table(runs, "toy", {"toy+less": "less"})
-    (row,) = table.rows
-    assert row.method == "less"
-    plain = {line.method: line for line in table_of(runs).rows}
-    assert "mirror" in plain
-    wanted = [b.value - a.value for a, b in zip(plain["toy"].cells, plain["toy+less"].cells)]
-    assert [cell.value for cell in row.cells] == pytest.approx(wanted)
-    assert any(wanted)
-    assert [float(cell.text.split()[0]) for cell in row.cells] == pytest.approx(wanted, abs=1e-3)
-
-
-def test_crossed_cells_are_differences_between_the_tasks(make_run):
-    conditions = (PLAIN, Condition("less", ("toy",), {"level": 0.5}))
-    runs = RunSet.read([make_run("run", settings={"toy": {"level": 0.25}}, conditions=conditions)])
-    names = {"toy+less": "less"}
-    plain, crossed = (ablation_table(runs, "toy", names, crossed=each) for each in (False, True))
-    (cells,), (found,) = ([row.cells for row in table.rows] for table in (plain, crossed))
-    by_task = {c.task: cell.value for c, cell in zip(plain.columns, cells) if c.task}
-    views = by_task.pop("novel_view")
-    assert [column.task for column in crossed.columns] == [SEEN_CAMERAS, UNSEEN_CAMERAS]
-    expected = [views - value for value in by_task.values()]
-    assert [cell.value for cell in found] == pytest.approx(expected, abs=1e-9)
-    assert any(abs(value) > 0 for value in expected)
-    assert crossed.columns[0].title == "Novel view minus self-reenactment at seen cameras"
-    assert "the same difference in self-reenactment" in crossed.caption
-
-
-def test_speeds_of_different_runs_are_not_compared(write_run):
-    runs = RunSet.read([write_run("run", {"ours": 30.0, "ours+less": 29.0})])
-    table = ablation_table(runs, "ours", {"ours+less": "less"})
-    assert "fps" in {column.metric for column in table_of(runs).columns}
-    assert "fps" not in {column.metric for column in table.columns}
-    assert [cell.value for cell in table.rows[0].cells] == pytest.approx(
-        [{"psnr": -1.0, "ssim": -0.025, "lpips": 0.001, "storage": -0.1}[c.metric] for c in table.columns]
-    )
-    assert "Speed" not in table.caption
-
-
-def test_coded_avatars_that_ablations_do_not_have_get_no_column(write_run):
-    folder = RunFolder(write_run("run", {"ours": 30.0, "ours+less": 29.0}))
-    rows = pd.read_parquet(folder.rows)
-    rows[~((rows.condition == "less") & (rows.metric == "storage"))].to_parquet(folder.rows)
-    table = ablation_table(RunSet.read([folder.root]), "ours", {"ours+less": "less"})
-    assert {column.metric for column in table.columns} == {"psnr", "ssim", "lpips"}
-    assert len(table.rows[0].cells) == len(table.columns)
-
-
-@pytest.mark.parametrize(
-    ("found", "text", "rank"),
-    [
-        ({"difference": -0.25, "low": -0.3, "high": -0.2, "p_holm": 0.02}, "-0.250 (-0.300, -0.200)", 1),
-        ({"difference": 0.25, "low": -0.1, "high": 0.4, "p_holm": 0.2}, "+0.250 (-0.100, +0.400)", None),
-        ({"difference": 0.25, "p_holm": 1.0}, "+0.250", None),
-        ({"reason": "failed on 1 subject"}, "failed on 1 subject", None),
-    ],
-)
-def test_a_cell_has_difference_interval_and_mark(found, text, rank):
-    cell = _cell(PairedComparison("novel_view", "psnr", True, "less", "whole", **found), 2)
-    assert (cell.text, cell.rank) == (text, rank)
-
-
-VALUES = {
-    "mean-image": 20.0,
-    "ga": 30.0,
-    "ours": 31.0,
-    "ours+less": 30.5,
-    "ga+tracked": 29.0,
-    "ours+tracked": 30.75,
-}
-TRACKED = {"ga": "ga+tracked", "ours": "ours+tracked"}
-DROP = {"ga": 1.5, "ours": 1.0, "ga+tracked": 0.25, "ours+tracked": -0.5}
+VALUES = {"mean-image": 20.0, "ga": 30.0, "ours": 31.0, "ours+less": 30.5, "ga+tracked": 29.0}
 
 
 @pytest.fixture
-def tracked_run(write_run):
-    """A suite's run whose self-reenactment is worse than its novel views by `DROP`."""
-    folder = RunFolder(write_run("suite/run", VALUES))
-    rows = pd.read_parquet(folder.rows)
-    for label, drop in DROP.items():
-        name, _, condition = label.partition("+")
-        own = (rows.method == name) & (rows.condition == condition)
-        rows.loc[own & (rows.task == "self_reenactment") & (rows.metric == "psnr"), "value"] -= drop
-    rows.to_parquet(folder.rows)
-    return folder.root
+def suite_run(write_run):
+    return write_run("suite/run/01", VALUES)
 
 
-def of_tracked(folder):
-    return RunSet.read([folder]).only([*TRACKED, *TRACKED.values()])
-
-
-def test_the_drop_is_novel_view_minus_self_reenactment(tracked_run):
-    table = drop_table(of_tracked(tracked_run))
-    assert {row.method: row.cells[-1].value for row in table.rows} == pytest.approx(DROP)
-    assert {row.method: float(row.cells[-1].text) for row in table.rows} == pytest.approx(DROP, abs=1e-4)
-    assert {row.method: row.cells[0].value for row in table.rows} == {name: VALUES[name] for name in DROP}
-
-
-def test_a_drop_is_missing_where_a_task_has_no_values(tracked_run):
-    folder = RunFolder(tracked_run)
-    rows = pd.read_parquet(folder.rows)
-    rows[rows.task != "self_reenactment"].to_parquet(folder.rows)
-    table = drop_table(of_tracked(tracked_run))
-    assert {row.method: row.cells[-1].value for row in table.rows} == dict.fromkeys(DROP)
-
-
-def test_rows_are_methods_and_cells_tracked_minus_plain(tracked_run):
-    runs = of_tracked(tracked_run)
-    table = condition_table(runs, TRACKED, "Tracked from images")
-    plain = {row.method: row.cells for row in table_of(runs).rows}
-    assert [row.method for row in table.rows] == [*TRACKED]
-    for line in table.rows:
-        wanted = [b.value - a.value for a, b in zip(plain[line.method], plain[TRACKED[line.method]])]
-        kept = [i for i, column in enumerate(table_of(runs).columns) if column.metric != "fps"]
-        assert [cell.value for cell in line.cells] == pytest.approx([wanted[i] for i in kept])
-
-
-def test_tracking_from_images_is_no_ablation(tracked_run):
-    sections = re.split("^## ", suite_report(tracked_run.parent, "ours"), flags=re.MULTILINE)[1:]
-    by_title = {section.partition("\n")[0]: section for section in sections}
-    ablations = ["", ", EMO", f", {CROSSED}"]
-    ablations = [f"Ablations of ours{what} (exploratory)" for what in ablations]
-    tracked = "Tracked from images (exploratory)"
-    plain = [
-        "Primary endpoints",
-        *(f"{name} (exploratory)" for name in ("All frames", "Sequence EMO", "Cost", "Speed")),
+def test_each_kind_of_captures_has_its_tables(write_run, suite_run):
+    write_run("suite/run-recorded/01", {"ga": 30.0, "ours": 31.0})
+    text = suite_report(suite_run.parents[1], "ours")
+    recorded, exact = (text.index(f"\n# {title}\n") for title in SECTIONS.values())
+    assert re.findall("^## (.*)", text[recorded:exact], re.MULTILINE) == [
+        *("All frames", "Sequence EMO", "Cost", "Speed")
     ]
-    assert [*by_title] == [*plain, tracked, *ablations]
-    assert {title for title, text in by_title.items() if "tracked" in text} == {tracked}
-    assert {title for title, text in by_title.items() if "| less" in text} == {*ablations}
+    assert re.findall("^## (.*)", text[exact:], re.MULTILINE)[4:] == [
+        "Conditions of ours",
+        "Conditions of ga",
+    ]
 
 
-def test_ablations_are_compared_under_their_own_tracking(write_run):
-    values = {"ga": 30.0, "ours": 31.0, "ours+less": 30.5, "ours+tracked": 29.0, "ours+less-tracked": 29.75}
-    text = suite_report(write_run("suite/run", values).parent, "ours")
-    found = {
-        title: re.search(r"^\| less +\|.*$", section, re.MULTILINE)
-        for title, section in re.findall(
-            r"^## (Ablations .*?) \(exploratory\)$(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL
-        )
-    }
-    for method, difference in {"ours": "-0.500", "ours+tracked": "+0.750"}.items():
-        assert difference in found[f"Ablations of {method}"].group()
-        assert "0.000" in found[f"Ablations of {method}, {CROSSED}"].group()
-    assert {*found} - {f"Ablations of ours{what}" for what in ("", ", EMO", f", {CROSSED}")} == {
-        f"Ablations of ours+tracked{what}" for what in ("", f", {CROSSED}")
-    }
+def test_methods_and_conditions_have_differences_alone(suite_run):
+    text = suite_report(suite_run.parents[1], "ours")
+    found = dict(re.findall(r"^\| `(\S+)` \| (\S+)", text, re.MULTILINE))
+    assert found == {"ga": "-1.0000", "ours+less": "-0.5000", "ga+tracked": "-1.0000"}
+    assert not re.search(r"is better|significant|<ins>|\*\*\d", text)
 
 
-def test_an_interrupted_training_has_the_processor_of_others(tracked_run):
-    folder = RunFolder(tracked_run)
+def test_an_interrupted_training_has_the_processor_of_others(suite_run):
+    folder = RunFolder(suite_run)
     record = json.loads(folder.manifest.read_text())
     (spec,) = (metric for metric in record["metrics"] if metric["name"] == "storage")
     record["metrics"].append({**spec, "name": "training_time"})
@@ -280,19 +187,8 @@ def test_an_interrupted_training_has_the_processor_of_others(tracked_run):
     times.loc[times.method == "ours", "machine"] = ""  # without a time
     times.loc[times.subject == "d", "machine"] = ""
     pd.concat([rows, times]).to_parquet(folder.rows)
-    text = suite_report(tracked_run.parent, "ours")
+    text = suite_report(suite_run.parents[1], "ours")
     assert "Trained on: one kind: subjects a, b, c; unknown processors: subjects d." in text
-
-
-def test_large_images_have_their_own_heading(write_run):
-    for name in ("run", "run-large"):
-        folder = write_run(f"suite/{name}/01", {"ga": 30.0, "ours": 31.0})
-    first, large = suite_report(folder.parents[1], "ours").split(f"\n# {LARGE}\n")
-    primary, usual = first.split("\n\n## All frames")
-    assert primary.startswith("## Primary endpoints")
-    assert ENDPOINTS in usual
-    # The endpoints are those of the whole suite: the other part has no note on them.
-    assert large.strip() == f"## All frames{usual}".replace(f"{ENDPOINTS}\n\n", "").strip()
 
 
 def avatar(subject, method, psnr, lpips, **more):
