@@ -63,10 +63,12 @@ class BlurLevel(NamedTuple):
     """Squared difference of colours at which a weight is a quarter, relative to the usual one."""
     landmarks: float
     """Weight of a landmark beside the prior, divided among the cameras."""
+    reach: float = 1.0
+    """Multiple of `OUTLINE_ROBUST` with several cameras, whose outlines show how far the mouth is open."""
 
 
 LEVELS = (
-    BlurLevel(5.0, 4, 64.0, 0.05),
+    BlurLevel(5.0, 4, 64.0, 0.05, 6.0),
     BlurLevel(2.5, 5, 32.0, 0.03),
     BlurLevel(1.2, 5, 16.0, 0.02),
     BlurLevel(0.7, 6, 4.0, 0.01),
@@ -213,8 +215,8 @@ class Fitter:
         weight: float,
         leave_out: bool = True,
     ) -> FloatArray:
-        """Add the landmarks to the equations with a weight; return their root mean square distance at each timestep, (T,) pixels;
-        0 where none is used."""
+        """Add the landmarks to the equations with a weight; return their root mean square distance at each timestep, (T,) pixels, the
+        median of the cameras, of which one may have found something else; 0 where none is used."""
         distance = np.zeros(len(state.poses))
         weight /= len(self.views.cameras)
         # Where cameras see the face together, their errors at lips and lids contradict one another.
@@ -233,7 +235,9 @@ class Fitter:
                 near = np.sqrt(square) / sigma < MISTAKEN_MM / LANDMARK_MM
                 seen &= ((seen & near).sum(axis=1) > seen.sum(axis=1) / 2)[:, None]
             robust = seen * emphasis * weight / (sigma * (1 + square / (ROBUST * sigma) ** 2)) ** 2
-            distance[row] = np.sqrt((seen * square).sum() / max(seen.sum(), 1))
+            used = seen.any(axis=1)
+            if used.any():
+                distance[row] = np.median(np.sqrt((seen * square).sum(axis=1)[used] / seen.sum(axis=1)[used]))
             weighted = robust[..., None, None] * projected.derivative
             curvature = np.einsum("cpki,cpkj->pij", weighted, projected.derivative)
             slope = np.einsum("cpki,cpk->pi", weighted, gap)
@@ -321,6 +325,7 @@ class Fitter:
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
         marks, prior = self.landmark_rig(), self._prior(keep_shape)
         scale = self._pixels_per_millimetre(mesh, state)
+        alone = len(self.views.cameras) == 1
         total, done = sum(level.steps for level in levels), 0
         landmarks = colours = cast(FloatArray, np.zeros(len(state.poses)))
         found = cast(FloatArray, np.zeros((len(vertices), 4)))
@@ -336,7 +341,7 @@ class Fitter:
                 )
                 if motion is not None:
                     equations.link(state.poses, motion)
-                self._add_outlines(equations, state, outlined)
+                self._add_outlines(equations, state, outlined, 1.0 if alone else level.reach)
                 state = equations.step(state, prior)
                 done += 1
         return Fitted(state, landmarks, colours, found)
@@ -385,15 +390,15 @@ class Fitter:
         return gaps(view.outline, projected.pixels, view.normals), projected, per_metre
 
     def _add_outlines(
-        self, equations: NormalEquations, state: HeadState, outlined: Sequence[OutlinedView]
+        self, equations: NormalEquations, state: HeadState, outlined: Sequence[OutlinedView], reach: float
     ) -> None:
-        """Add the distances between both outlines to the equations."""
+        """Add the distances between both outlines to the equations. ``reach``: That of the level."""
         for view in outlined:
             posed = view.rig.linearised(state.shape, state.poses[view.row])
             found, projected, per_metre = self._gaps(view, posed.points)
             sigma = 1e-3 * OUTLINE_MM * per_metre
             robust = found.aligned * OUTLINE_WEIGHT
-            robust /= (sigma * (1 + (found.distance / (OUTLINE_ROBUST * sigma)) ** 2)) ** 2
+            robust /= (sigma * (1 + (found.distance / (reach * OUTLINE_ROBUST * sigma)) ** 2)) ** 2
             along = np.einsum("ni,nik->nk", found.normals, projected.derivative)
             curvature = robust[:, None, None] * along[:, :, None] * along[:, None]
             equations.add(view.row, posed, curvature, (robust * found.distance)[:, None] * along)

@@ -433,14 +433,19 @@ WORSE = 2.5
 """Minimum ratio of a residual to its median that counts as a fit that failed."""
 
 
-def outliers(poses: FloatArray, residuals: FloatArray, columns: PoseColumns) -> BoolArray:
-    """(T,) timesteps without a fit to landmarks, with a jump of the head, or with a much larger residual than their neighbours.
+def outliers(
+    poses: FloatArray, residuals: FloatArray, columns: PoseColumns, *, jumps: bool = True
+) -> BoolArray:
+    """(T,) timesteps without a fit to landmarks, with a much larger residual than their neighbours, or with a jump of the head.
 
     ``poses``: (T, D) columns of ``columns``. ``residuals``: (T, 2) `TimestepResidual` without the timestep; 0 pixels where
-    no landmark was used.
+    no landmark was used. ``jumps``: Whether jumps are faults. Several cameras determine a pose without its neighbours, and timesteps
+    of a capture may be far apart.
     """
-    turns = (rotation_of(poses[:, :3]) * rotation_of(poses[:, 3:6])).as_matrix().reshape(-1, 9)
     wrong = (residuals[:, 0] <= 0) | (residuals > WORSE * _median(residuals)).any(axis=1)
+    if not jumps:
+        return np.asarray(wrong)
+    turns = (rotation_of(poses[:, :3]) * rotation_of(poses[:, 3:6])).as_matrix().reshape(-1, 9)
     # The Frobenius norm of the difference of two rotations is about their angle times the root of 2.
     for values, least in ((turns / np.sqrt(2), TURN), (poses[:, columns.translation], MOVE)):
         distances = np.linalg.norm(values - _median(values), axis=1)

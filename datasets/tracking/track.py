@@ -125,7 +125,7 @@ class TimestepResidual(NamedTuple):
 
     timestep: int
     landmarks_px: float
-    """Root mean square distance between landmarks and their projections, pixels."""
+    """Root mean square distance between landmarks and their projections, pixels; the median of the cameras."""
     colour_levels: float
     """Median difference of a colour from that of its surface point, 8-bit levels."""
 
@@ -361,7 +361,7 @@ class _Fits:
         fitted = sorted(self.poses)
         poses = np.stack([self.poses[timestep] for timestep in fitted])
         residuals = np.array([self.residuals[timestep] for timestep in fitted])
-        wrong = outliers(poses, residuals, PoseColumns.of(self.clip.head))
+        wrong = outliers(poses, residuals, PoseColumns.of(self.clip.head), jumps=len(self.cameras) == 1)
         return {timestep for timestep, bad in zip(fitted, wrong) if bad}
 
 

@@ -8,7 +8,7 @@ from headbench.bench.contracts import Camera
 from headbench.datasets.head.arrays import with_derived_regions
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.mesh_pictures import rasterize_mesh
-from headbench.datasets.tracking.equations import HeadState
+from headbench.datasets.tracking.equations import HeadState, NormalEquations
 from headbench.datasets.tracking.fit import LEVELS, Fitter, sampled_vertices
 from headbench.datasets.tracking.landmarks import ImageLandmarks
 from headbench.datasets.tracking.outline import outline_of
@@ -28,6 +28,13 @@ def camera():
     motion = np.diag([1.0, -1, -1, 1])
     motion[:3, 3] = [0, 0, 1.0]
     return Camera("0", SIZE, SIZE, K, motion)
+
+
+def turned(camera, angle):
+    """The camera, moved by an angle around the vertical axis."""
+    motion = np.array(camera.world_to_camera)
+    motion[:3, :3] = motion[:3, :3] @ Rotation.from_euler("y", angle).as_matrix()
+    return Camera(f"{angle:g}", SIZE, SIZE, camera.K, motion)
 
 
 def resting(head):
@@ -53,6 +60,35 @@ def test_an_outline_moves_the_head_where_colours_say_nothing(head, camera, maske
     rig = PointRig.at_vertices(head, np.asarray(head.regions["nose"]))
     moved = rig.points(found.shape, found.poses[0]) - mesh[head.regions["nose"]]
     assert abs(1e3 * moved[:, 0].mean()) == pytest.approx(left_mm, abs=1.0)
+
+
+def test_outlines_of_several_cameras_open_the_mouth(head, camera):
+    views = [turned(camera, angle) for angle in (-0.8, 0.8)]
+    state, opened = resting(head), resting(head)
+    opened.poses[0, 6] = 0.4  # the jaw
+    rig = PointRig.at_vertices(head, np.arange(len(head.template)))
+    mesh = rig.points(opened.shape, opened.poses[0]).astype(np.float64)
+    masks = [
+        np.where(rasterize_mesh(mesh, head.faces, view).face >= 0, 255, 0).astype(np.uint8) for view in views
+    ]
+    landmarks = NOTHING._replace(pixels=np.repeat(NOTHING.pixels, 2, axis=1))
+    fitter = Fitter(head, Views(views), landmarks, sampled_vertices(head), [outline_of(one) for one in masks])
+    found = fitter.fit_colours(state, FrameStack([GREY] * 2), levels=LEVELS[:2], keep_shape=True).state
+    lips = np.asarray(head.regions["lips"])
+    gaps = [rig.points(one.shape, one.poses[0])[lips] - mesh[lips] for one in (state, found)]
+    before, after = (np.sqrt((gap**2).sum(axis=1).mean()) for gap in gaps)
+    assert after < 0.5 * before
+
+
+def test_the_residual_is_not_that_of_one_wrong_camera(head, camera):
+    views = Views([turned(camera, angle) for angle in (-0.4, 0.0, 0.4)])
+    members = np.asarray(head.regions["nose"])
+    pixels = views.project(np.asarray(head.template, np.float64)[members]).pixels
+    pixels[2] += 10  # 14 mm, too little to be left out
+    corners, weights = np.repeat(members[:, None], 3, axis=1), np.tile([1.0, 0, 0], (len(members), 1))
+    landmarks = ImageLandmarks(corners, weights, pixels[None], NOTHING.pairs)
+    fitter, state = Fitter(head, views, landmarks, sampled_vertices(head)), resting(head)
+    assert fitter.add_landmarks(NormalEquations(state), fitter.landmark_rig(), state, 1.0)[0] < 0.1
 
 
 @pytest.mark.parametrize("linked", [True, False])

@@ -188,6 +188,8 @@ def test_outliers_are_jumps_and_failed_fits():
     residuals[30] = 2.0, 6.0
     residuals[35:38] = 0.0, 1.0
     assert np.flatnonzero(outliers(poses, residuals, columns)).tolist() == [5, 6, 7, 12, 30, 35, 36, 37]
+    failed = outliers(poses, residuals, columns, jumps=False)
+    assert np.flatnonzero(failed).tolist() == [30, 35, 36, 37]
     assert not outliers(poses[::8], residuals[:5], columns).any()  # so few that motion looks like jumps
 
 
