@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,8 +21,10 @@ from ..bench.errors import UnavailableError
 from ..bench.machine import use_device
 from ..bench.specs import MetricSpec, Need
 from .faces import named_file, network_need
-from .inception import Inception
 from .psnr import check_pair
+
+if TYPE_CHECKING:
+    from .inception import Inception
 
 VARIABLE = "HEADBENCH_INCEPTION"
 BATCH = 4
@@ -84,6 +87,8 @@ def _root(sample: FloatArray, mean: FloatArray) -> FloatArray:
 
 @functools.cache
 def _network(path: Path, device: str) -> Inception:
+    from .inception import Inception  # imports torch
+
     use_device(device)
     return Inception(path, device)
 
@@ -94,6 +99,8 @@ def needs(config: object, device: str) -> Iterator[Need]:
 
 
 def _inception() -> Inception:
+    from .inception import Inception
+
     return Inception(named_file("FID", VARIABLE, REMEDY))
 
 

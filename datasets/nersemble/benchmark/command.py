@@ -1,17 +1,87 @@
-"""``headbench submission write`` and ``submission check``."""
+"""``headbench prepare benchmark``, ``submission write`` and ``submission check``."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
 from ....bench.contracts import Progress, no_progress
-from ....bench.errors import ExitCode, UnavailableError
+from ....bench.errors import ExitCode, InputError, UnavailableError
+from ....bench.io.files import check_kind
 from ....bench.specs import CommandResult, command
+from ..names import chosen_subjects
 
 SHOWN = 20
+
+
+@dataclass(frozen=True)
+class BenchmarkPrepareSettings:
+    """Convert the training data of the NeRSemble benchmark to captures: all training sequences and cameras, images on white
+    as they are, masks, and the tracking of the monocular track."""
+
+    data: tyro.conf.Positional[str]
+    """The benchmark's folder, as nersemble-benchmark-download leaves it: it holds mono_flame_avatar/ or nvs/."""
+
+    head: str
+    """FLAME 2023 (flame2023.pkl), which the tracking belongs to. It is not copied."""
+
+    out: str
+    """Folder for the captures."""
+
+    track: Literal["nvs", "mono_flame_avatar"] = "mono_flame_avatar"
+    """Task of the benchmark. Captures of nvs have no tracking: their poses are zero, for `headbench track`."""
+
+    participants: str = ""
+    """Participants separated by commas; default: all that were downloaded."""
+
+    test: tuple[str, ...] = ()
+    """Training sequences that are held out, as the benchmark's own test frames are not public; default: none, so that
+    methods are trained on everything, and nothing is measured."""
+
+    every: int = 1
+    """Keep the frames whose number this divides; of nvs, which has 73 frames a second, the default are all."""
+
+    workers: int = 0
+    """Number of cameras processed at a time; 0 stands for one per processor core."""
+
+
+@command("prepare benchmark", group="data", writes="out")
+def prepare_benchmark(settings: BenchmarkPrepareSettings, progress: Progress = no_progress) -> CommandResult:
+    """Convert the training data of the NeRSemble benchmark to captures."""
+    from ...head.loaders import load_head
+    from ..prepare import prepare  # imports torch
+    from ..recording import participant, participants
+    from .prepare import plan_participant
+    from .submission import MONO, TRACKS
+
+    data, track, out = Path(settings.data), TRACKS[settings.track], Path(settings.out)
+    root = data / track.name
+    if settings.every < 1:
+        raise InputError("command line", "--every", "a number from 1", f"{settings.every}")
+    subjects = chosen_subjects(settings.participants) if settings.participants else [*participants(root)]
+    check_kind(out, "captures")
+    head = load_head(settings.head)
+    plans = [
+        plan_participant(data, track, participant(root, subject), head, out, settings.test, settings.every)
+        for subject in subjects
+    ]
+    results = prepare(plans, workers=settings.workers, progress=progress)
+    lines = []
+    for result in results:
+        splits = ", ".join(f"{count} {name}" for name, count in result.frames.items() if count)
+        lines += [
+            f"{result.subject}: {result.written} images written, {result.kept} there already: {splits}."
+        ]
+        given = f"--head {settings.head}"
+        if track is MONO:
+            use = f"headbench run --data {result.union} {given} --out runs/{result.subject}"
+        else:
+            use = f"headbench track {result.union} {given} --out {settings.out}-tracked"
+        lines += [f"  Use it: {use}"]
+    return CommandResult("\n".join(lines), {result.subject: str(result.union) for result in results})
 
 
 @command("submission write", group="export")

@@ -8,89 +8,34 @@ The track of novel views has no tracking, so that its captures are for `headbenc
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import tyro
 
-from ....bench.contracts import Camera, FloatArray, Progress, no_progress
+from ....bench.contracts import Camera, FloatArray
 from ....bench.errors import InputError
-from ....bench.io.files import check_kind
-from ....bench.specs import CommandResult, command
 from ...ga.tracking import POSE_SIZES, pose_to_parameters, resolve_teeth
 from ...head.arrays import HeadArrays
-from ...head.loaders import load_head
-from ..names import SEQUENCES, chosen_subjects, match_sequence
+from ..names import SEQUENCES, match_sequence
 from ..plan import PreparationPlan, SequenceJob
-from ..prepare import prepare
-from ..recording import Calibration, Participant, participant, participants, read_calibration
+from ..recording import Calibration, Participant, read_calibration
 from ..sequence import RecordedSequence, read_sequence
 from ..tracking import TrackedSequence
 from .render import read_sequence as read_tracked_sequence
-from .submission import MONO, TRACKS, TrackName, tracking_file
+from .submission import MONO, BenchmarkTrack, tracking_file
 
 
-@dataclass(frozen=True)
-class BenchmarkPrepareSettings:
-    """Convert the training data of the NeRSemble benchmark to captures: all training sequences and cameras, images on white
-    as they are, masks, and the tracking of the monocular track."""
-
-    data: tyro.conf.Positional[str]
-    """The benchmark's folder, as nersemble-benchmark-download leaves it: it holds mono_flame_avatar/ or nvs/."""
-
-    head: str
-    """FLAME 2023 (flame2023.pkl), which the tracking belongs to. It is not copied."""
-
-    out: str
-    """Folder for the captures."""
-
-    track: TrackName = "mono_flame_avatar"
-    """Task of the benchmark. Captures of nvs have no tracking: their poses are zero, for `headbench track`."""
-
-    participants: str = ""
-    """Participants separated by commas; default: all that were downloaded."""
-
-    test: tuple[str, ...] = ()
-    """Training sequences that are held out, as the benchmark's own test frames are not public; default: none, so that
-    methods are trained on everything, and nothing is measured."""
-
-    every: int = 1
-    """Keep the frames whose number this divides; of nvs, which has 73 frames a second, the default are all."""
-
-    workers: int = 0
-    """Number of cameras processed at a time; 0 stands for one per processor core."""
-
-
-@command("prepare benchmark", group="data", writes="out")
-def prepare_benchmark(settings: BenchmarkPrepareSettings, progress: Progress = no_progress) -> CommandResult:
-    """Convert the training data of the NeRSemble benchmark to captures."""
-    root = Path(settings.data) / settings.track
-    if settings.every < 1:
-        raise InputError("command line", "--every", "a number from 1", f"{settings.every}")
-    subjects = chosen_subjects(settings.participants) if settings.participants else [*participants(root)]
-    check_kind(Path(settings.out), "captures")
-    head = load_head(settings.head)
-    plans = [_plan(settings, participant(root, subject), head) for subject in subjects]
-    results = prepare(plans, workers=settings.workers, progress=progress)
-    lines = []
-    for result in results:
-        splits = ", ".join(f"{count} {name}" for name, count in result.frames.items() if count)
-        lines += [
-            f"{result.subject}: {result.written} images written, {result.kept} there already: {splits}."
-        ]
-        given = f"--head {settings.head}"
-        if settings.track == MONO.name:
-            use = f"headbench run --data {result.union} {given} --out runs/{result.subject}"
-        else:
-            use = f"headbench track {result.union} {given} --out {settings.out}-tracked"
-        lines += [f"  Use it: {use}"]
-    return CommandResult("\n".join(lines), {result.subject: str(result.union) for result in results})
-
-
-def _plan(settings: BenchmarkPrepareSettings, one: Participant, head: HeadArrays) -> PreparationPlan:
+def plan_participant(
+    data: Path,
+    track: BenchmarkTrack,
+    one: Participant,
+    head: HeadArrays,
+    out: Path,
+    test: Sequence[str] = (),
+    every: int = 1,
+) -> PreparationPlan:
     """Read everything about a participant except the pixels."""
-    track, data = TRACKS[settings.track], Path(settings.data)
     names = [
         name for name in SEQUENCES if name in one.sequences and (one.sequences[name] / "images").is_dir()
     ]
@@ -98,17 +43,15 @@ def _plan(settings: BenchmarkPrepareSettings, one: Participant, head: HeadArrays
         expected = "sequences with images/cam_SERIAL.mp4"
         remedy = f"Download them: nersemble-benchmark-download FOLDER {track.name}."
         raise InputError(data / track.name / one.subject, "sequences", expected, "none", remedy)
-    test = [match_sequence(data, name, names) for name in settings.test]
-    if not set(names) - set(test):
-        raise InputError("command line", "--test", "at least one sequence to train on", ", ".join(test))
+    held_out = [match_sequence(data, name, names) for name in test]
+    if not set(names) - set(held_out):
+        raise InputError("command line", "--test", "at least one sequence to train on", ", ".join(held_out))
     calibration = read_calibration(one.calibration_file)
     jobs: list[SequenceJob] = []
     for name in names:
         videos = {path.stem.removeprefix("cam_") for path in (one.sequences[name] / "images").glob("*.mp4")}
         serials = [serial for serial in calibration.serials if serial in videos]
-        recorded = read_sequence(
-            one, calibration, name, cameras=serials, source="video", every=settings.every
-        )
+        recorded = read_sequence(one, calibration, name, cameras=serials, source="video", every=every)
         for view in recorded.views.values():
             if view.size != track.size:
                 expected, found = (f"{width}x{height}" for width, height in (track.size, view.size))
@@ -123,10 +66,10 @@ def _plan(settings: BenchmarkPrepareSettings, one: Participant, head: HeadArrays
             cameras, tracked = _tracked(data, recorded, head, shape)
         else:
             cameras, tracked = _untracked(calibration, recorded, head)
-        folder = Path(os.path.abspath(settings.out)) / f"{one.subject}_{name}_v{len(serials)}_whiteBg"
+        folder = Path(os.path.abspath(out)) / f"{one.subject}_{name}_v{len(serials)}_whiteBg"
         jobs.append(SequenceJob(recorded, cameras, {}, {}, tracked, folder, on_white=True))
     union = jobs[0].folder.parent / f"UNION{len(jobs)}_{one.subject}_{track.name}"
-    return PreparationPlan(one.subject, jobs, test, head, head.version, union, novel_views=())
+    return PreparationPlan(one.subject, jobs, held_out, head, head.version, union, novel_views=())
 
 
 def _tracked(

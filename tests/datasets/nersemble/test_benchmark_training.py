@@ -13,7 +13,7 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.arrays import save_head
 from headbench.datasets.head.model import PosedSubject
-from headbench.datasets.nersemble.benchmark.prepare import BenchmarkPrepareSettings, prepare_benchmark
+from headbench.datasets.nersemble.benchmark.command import BenchmarkPrepareSettings, prepare_benchmark
 from headbench.datasets.nersemble.benchmark.submission import MONO, NVS, tracking_file
 
 from ..head.toy import toy_head
