@@ -209,7 +209,7 @@ def bake(
     middle = rest.means.mean(axis=0)
     few = [camera_at(middle + AWAY_M * direction_of(*angles)) for angles in FEW_DIRECTIONS]
     colors = [_colors(source, source.rest, camera) for camera in few]
-    weights = _weights(source, rest)
+    weights = skinning_weights(source, rest)
     harmonics = _harmonics(source, middle, degree, directions)
     progress(1, total, "at rest")
     morphs: dict[str, list[FloatArray]] = {
@@ -240,7 +240,7 @@ def _colors(source: Source, pose: HeadPose, camera: Camera) -> FloatArray:
     return colors
 
 
-def _weights(source: Source, rest: Seen) -> FloatArray:
+def skinning_weights(source: Source, rest: Seen) -> FloatArray:
     """(N, 4) skinning weights: least squares over a turn of each joint about x and y."""
     moves = np.zeros((len(rest.means), len(JOINTS)))
     for joint in range(len(JOINTS)):
