@@ -40,7 +40,7 @@ from ..splats.reference import rotation_matrices
 from .glb import ELEMENT_ARRAY_BUFFER, Glb, GlbWriter
 from .harmonics import camera_at, direction_of
 from .settings import ExportLamSettings
-from .web.bake import AWAY_M, FEW_DIRECTIONS, Moved, Source, rotation_of, skinning_weights
+from .web.bake import AWAY_M, Moved, Source, rotation_of, skinning_weights
 from .web.export import NECK, VIEWS, camera_of, open_source, psnr, quaternions, view_around
 
 PLY, SKIN, ORDER, ANIMATION = "offset.ply", "skin.glb", "vertex_order.json", "animation.glb"
@@ -63,6 +63,8 @@ CAMERA, PITCH, FIELD_OF_VIEW = (0.0, 1.8, 1.0), -10.0, 50.0
 """Position, metres, and angles, degrees, of the viewers' fixed camera."""
 FILLED = 0.75
 """Fraction of the height of the picture that the splats fill."""
+SEEN_FROM = ((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.3), (0.0, -0.3))
+"""Azimuth and elevation, radians, of the views whose mean colours are exported; the viewers look from the front."""
 TOGETHER: Mapping[str, float] = {
     "jawOpen": 0.5,
     "mouthSmileLeft": 0.5,
@@ -134,7 +136,7 @@ def sample(source: Source, faces: Sequence[Face], progress: Progress) -> LamAvat
     rest = source.seen(source.rest)
     middle = rest.means.mean(axis=0)
     colors = []
-    for angles in FEW_DIRECTIONS:
+    for angles in SEEN_FROM:
         seen = source.seen(source.rest, camera_at(middle + AWAY_M * direction_of(*angles)))
         assert seen.colors is not None  # the camera is given
         colors.append(seen.colors)
@@ -249,17 +251,19 @@ def read_folder(folder: Path) -> LamAvatar:
 def measure_losses(
     source: Source, found: LamAvatar, faces: PerformedFaces, progress: Progress
 ) -> dict[str, float]:
-    """Minimum PSNR in dB against the avatar itself: at rest, of single blendshapes, of several and of a turned head."""
+    """Minimum PSNR in dB against the avatar itself: at rest, from the front and over `VIEWS`, of single blendshapes from the
+    front, of several at once, and of a turned head."""
     view = view_around(found.means)
     still: FloatArray = np.zeros(3)
     trials: list[tuple[str, Face, FloatArray, Sequence[tuple[float, float]]]]
-    trials = [("rest", Face(np.zeros(len(ARKIT)), source.rest), still, VIEWS)]
+    neutral = Face(np.zeros(len(ARKIT)), source.rest)
+    trials = [("front", neutral, still, VIEWS[:1]), ("rest", neutral, still, VIEWS)]
     trials += [("blendshapes", face, still, VIEWS[:1]) for face in faces.single]
     trials.append(("together", faces.together, still, VIEWS))
     for axis in (0, 1):
         turn: FloatArray = NECK / 2 * np.eye(3)[axis]
         pose = replace(source.rest, neck=turn.astype(source.rest.neck.dtype))
-        trials.append(("head turned", Face(trials[0][1].values, pose), turn, VIEWS))
+        trials.append(("head turned", neutral._replace(pose=pose), turn, VIEWS))
     losses: dict[str, float] = {}
     for number, (name, face, turn, views) in enumerate(trials):
         moved = found.moved(face.values, turn)
