@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,7 +40,7 @@ from ..splats.reference import rotation_matrices
 from .glb import ELEMENT_ARRAY_BUFFER, Glb, GlbWriter
 from .harmonics import camera_at, direction_of
 from .settings import ExportLamSettings
-from .web.bake import AWAY_M, Moved, Source, rotation_of, skinning_weights
+from .web.bake import AWAY_M, Moved, Source, colors_from, rotation_of, skinning_weights
 from .web.export import NECK, VIEWS, camera_of, open_source, psnr, quaternions, view_around
 
 PLY, SKIN, ORDER, ANIMATION = "offset.ply", "skin.glb", "vertex_order.json", "animation.glb"
@@ -65,13 +65,8 @@ FILLED = 0.75
 """Fraction of the height of the picture that the splats fill."""
 SEEN_FROM = ((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.3), (0.0, -0.3))
 """Azimuth and elevation, radians, of the views whose mean colours are exported; the viewers look from the front."""
-TOGETHER: Mapping[str, float] = {
-    "jawOpen": 0.5,
-    "mouthSmileLeft": 0.5,
-    "mouthSmileRight": 0.5,
-    "eyeBlinkLeft": 0.5,
-}
-"""Blendshapes at once, for which the loss is measured."""
+TOGETHER = ("jawOpen", "mouthSmileLeft", "mouthSmileRight", "eyeBlinkLeft")
+"""Blendshapes that are at 0.5 at once, for which the loss is measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +117,7 @@ def perform(head: HeadArrays, rest: HeadPose, progress: Progress) -> PerformedFa
     have them from the embedded head."""
     rows = np.eye(len(ARKIT))
     rows[ARKIT.index("mouthClose"), ARKIT.index("jawOpen")] = 1.0
-    rows = np.concatenate([rows, [[TOGETHER.get(name, 0.0) for name in ARKIT]]])
+    rows = np.concatenate([rows, [[0.5 * (name in TOGETHER) for name in ARKIT]]])
     request = SignalRequest(Path("blendshapes"), head, signal_head=AVATAR if arkit_columns(head) else "")
     signal = apply_blendshapes(request, dict(zip(ARKIT, rows.T)), Timing.regular(len(rows)))
     found = transfer(signal, head, None, progress)
@@ -135,11 +130,8 @@ def sample(source: Source, faces: Sequence[Face], progress: Progress) -> LamAvat
     """Sample the splats of an avatar at rest and in one face for each blendshape."""
     rest = source.seen(source.rest)
     middle = rest.means.mean(axis=0)
-    colors = []
-    for angles in SEEN_FROM:
-        seen = source.seen(source.rest, camera_at(middle + AWAY_M * direction_of(*angles)))
-        assert seen.colors is not None  # the camera is given
-        colors.append(seen.colors)
+    cameras = [camera_at(middle + AWAY_M * direction_of(*angles)) for angles in SEEN_FROM]
+    colors = [colors_from(source, source.rest, camera) for camera in cameras]
     displaced = np.empty((len(ARKIT), *rest.means.shape))
     for number, face in enumerate(faces):
         displaced[number] = source.seen(face.pose).means - rest.means
@@ -283,11 +275,12 @@ def export_lam(settings: ExportLamSettings, progress: Progress = no_progress) ->
     else:
         check_output_folder(out)
     _, head, source, _ = open_source(settings, progress)
+    count = len(source.avatar.splats(source.rest).means)
+    if count > MOST_SPLATS:
+        expected = f"an avatar of at most {MOST_SPLATS} splats, which the viewers can show"
+        raise InputError(Path(settings.avatar), "", expected, str(count))
     faces = perform(head, source.rest, progress)
     sampled = sample(source, faces.single, progress)
-    if len(sampled.means) > MOST_SPLATS:
-        expected = f"an avatar of at most {MOST_SPLATS} splats, which the viewers can show"
-        raise InputError(Path(settings.avatar), "", expected, str(len(sampled.means)))
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary, out.stem) if archive else out
         folder.mkdir(parents=True, exist_ok=True)
@@ -299,12 +292,12 @@ def export_lam(settings: ExportLamSettings, progress: Progress = no_progress) ->
     reach = np.linalg.norm(found.morphs, axis=2).max(axis=1)
     missing = [name for name, far in zip(ARKIT, reach) if far < STILL_M]
     losses = measure_losses(source, found, faces, progress)
-    text = f"{out}: {len(found.means)} splats, {len(ARKIT) - len(missing)} blendshapes, {size / 1e6:.2f} MB; "
+    text = f"{out}: {count} splats, {len(ARKIT) - len(missing)} blendshapes, {size / 1e6:.2f} MB; "
     text += "PSNR against headbench's renderer: "
     text += ", ".join(f"{name} {value:.1f}" for name, value in losses.items()) + " dB"
     if missing:
         text += f"\nThe head model has no {', '.join(missing)}."
     if faces.residual_mm is not None:
         text += f"\nBlendshapes are those of the embedded head, transferred with {faces.residual_mm:.2f} mm of error."
-    data = {"out": out, "splats": len(found.means), "bytes": size, "psnr": losses, "missing": missing}
+    data = {"out": out, "splats": count, "bytes": size, "psnr": losses, "missing": missing}
     return CommandResult(text, data | {"residual_mm": faces.residual_mm})

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Frame, no_progress
+from headbench.bench.errors import InputError
 from headbench.datasets.drive.signal import ARKIT, blendshape_parts
 from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.head.procedural.model import procedural_head
@@ -82,6 +83,7 @@ def glb(path):
 
 
 def parts_of(path):
+    """Header, vertices, and morph targets by name of a mesh."""
     header, values = glb(path / "skin.glb")
     (mesh,) = header["meshes"]
     (primitive,) = mesh["primitives"]
@@ -132,11 +134,7 @@ def test_morphs_are_the_displacements_of_the_head(exported, source, name):
     displaced = source.avatar.splats(pose).means - source.avatar.splats(source.rest).means
     assert np.abs(displaced).max() > 1e-3
     np.testing.assert_allclose(morphs[name], displaced, atol=5e-6)
-
-
-def test_mouth_close_counters_the_open_jaw(exported):
-    home, _ = exported
-    _, _, morphs = parts_of(home / "face")
+    # which counters the open jaw
     np.testing.assert_allclose(morphs["mouthClose"], -morphs["jawOpen"], atol=1e-5)
 
 
@@ -174,6 +172,17 @@ def test_bones_place_the_head_before_the_camera(exported, source):
     up = means @ [0, np.cos(np.radians(10)), -np.sin(np.radians(10))]
     assert depth.min() > 0.1
     assert 0.5 < np.abs(up / depth).max() / np.tan(np.radians(25)) < 1
+
+
+def test_avatars_beyond_the_viewers_texture_are_refused(source, tmp_path):
+    opened = Opened(None, procedural_head(), source, None)
+    settings = ExportLamSettings("avatar", str(tmp_path / "face.zip"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lam, "open_source", lambda settings, progress: opened)
+        patch.setattr(lam, "MOST_SPLATS", 100)
+        with pytest.raises(InputError, match="at most 100 splats"):
+            lam.export_lam(settings, no_progress)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_archives_have_an_entry_for_their_folder(exported):
