@@ -325,6 +325,10 @@ CASES = {
         )
         for name in ("ours",)
     ],
+    "export lam": [
+        case(f"export lam {cell('ga')} --out viewer", "blendshapes .* dB", "viewer/skin.glb"),
+        case(f"export lam {cell('ours')} --out viewer.zip", "head turned", "viewer.zip"),
+    ],
     "export ply": [
         case(f"export ply {cell(name)}/avatar --out {name}.ply", "splats", f"{name}.ply")
         for name in ("ours", "ga")

@@ -284,7 +284,7 @@ def blendshape_parts(head: HeadArrays) -> dict[str, dict[str, FloatArray]]:
     }
     if is_embedded(head):
         return weights_by_shape | _embedded_parts(head.version)
-    columns = _named_columns(head)
+    columns = arkit_columns(head)
     if not columns:
         expected = "the embedded head, or one with expressions of ARKit's names such as ICT-FaceKit's"
         raise InputError("command line", "--signal-head", expected, head.version)
@@ -325,7 +325,7 @@ def _joint(weights: Mapping[str, float]) -> dict[str, FloatArray]:
     return parts
 
 
-def _named_columns(head: HeadArrays) -> dict[str, FloatArray]:
+def arkit_columns(head: HeadArrays) -> dict[str, FloatArray]:
     """(E,) directions by ARKit's name of the head's named expressions; ``_L`` and ``_R`` stand for Left and Right."""
     shapes: dict[str, FloatArray] = {}
     for name, column in zip(head.expression_names, np.eye(len(head.expression_names))):

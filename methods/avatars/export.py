@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import io
 import json
-import struct
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -28,6 +27,7 @@ from ..shared.avatar_files import read_shared_head
 from ..shared.rendering import view_of
 from ..shared.tensor_files import read_ply, write_ply
 from ..splats import rasterize
+from .glb import Glb, GlbWriter
 from .harmonics import DEGREE, FIELD_OF_VIEW, direction_of, harmonics_of, orbit_camera
 from .settings import AvatarOptions, ExportGlbSettings, ExportOptions, ExportPlySettings, ExportSogSettings
 from .web.bake import Source
@@ -101,7 +101,7 @@ def _read_ply(path: Path) -> StoredSplats:
 
 EXTENSION = "KHR_gaussian_splatting"
 """Khronos, extensions/2.0/Khronos/KHR_gaussian_splatting: linear scales, opacities from 0 to 1, quaternions xyzw."""
-FLOAT, ARRAY_BUFFER, POINTS = 5126, 34962, 0
+POINTS = 0
 HARMONICS = [(degree, number) for degree in range(4) for number in range(2 * degree + 1)]
 
 
@@ -121,61 +121,34 @@ def _write_glb(path: Path, splats: StoredSplats) -> None:
             for index, (degree, number) in enumerate(HARMONICS)
         },
     }
-    accessors: list[dict[str, Any]] = []
-    views: list[dict[str, int]] = []
-    blocks, place = [], 0
-    for values in attributes.values():
-        block = np.ascontiguousarray(values.numpy(), "<f4").tobytes()
-        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[1 if values.ndim == 1 else values.shape[1]]
-        accessors.append(
-            {"bufferView": len(views), "componentType": FLOAT, "count": len(values), "type": kind}
-        )
-        views.append({"buffer": 0, "byteOffset": place, "byteLength": len(block), "target": ARRAY_BUFFER})
-        blocks.append(block)
-        place += len(block)
-    low, high = splats.means.amin(0), splats.means.amax(0)
-    accessors[0] |= {"min": low.tolist(), "max": high.tolist()}
-    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {
-        "attributes": {name: number for number, name in enumerate(attributes)},
-        "mode": POINTS,
-        "extensions": {EXTENSION: extension},
+    writer = GlbWriter()
+    numbers = {
+        name: writer.add(values.numpy(), bounds=name == "POSITION") for name, values in attributes.items()
     }
-    header = {
-        "asset": {"version": "2.0", "generator": tool(), "extras": {"note": note(RENDER)}},
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"attributes": numbers, "mode": POINTS, "extensions": {EXTENSION: extension}}
+    scene = {
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": place}],
     }
-    text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    whole = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + place)
-    whole += struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", place, b"BIN\0")
-    write_bytes(path, whole + b"".join(blocks))
+    writer.write(path, scene)
 
 
 def _read_glb(path: Path) -> StoredSplats:
     """Read what `_write_glb` wrote."""
-    content = read_bytes(path, "a GLB file")
-    (length,) = struct.unpack_from("<I", content, 12)
-    header, start = json.loads(content[20 : 20 + length]), 28 + length
-    columns = {}
-    for name, number in header["meshes"][0]["primitives"][0]["attributes"].items():
-        accessor = header["accessors"][number]
-        view = header["bufferViews"][accessor["bufferView"]]
-        values = np.frombuffer(content, "<f4", view["byteLength"] // 4, start + view["byteOffset"])
-        columns[name.removeprefix(f"{EXTENSION}:")] = torch.from_numpy(
-            values.reshape(accessor["count"], -1).copy()
-        )
+    content = Glb.read(path)
+    (primitive,) = content.header["meshes"][0]["primitives"]
+    columns = {
+        name.removeprefix(f"{EXTENSION}:"): torch.from_numpy(content.array(number).copy())
+        for name, number in primitive["attributes"].items()
+    }
     harmonics = [columns[f"SH_DEGREE_{degree}_COEF_{number}"] for degree, number in HARMONICS]
     return StoredSplats(
         *(columns["POSITION"], columns["ROTATION"][:, [3, 0, 1, 2]].contiguous()),
-        *(columns["SCALE"], columns["OPACITY"][:, 0]),
+        *(columns["SCALE"], columns["OPACITY"]),
         *(harmonics[0], torch.stack(harmonics[1:], dim=2)),
     )
 

@@ -162,6 +162,22 @@ class ExportHtmlSettings(AvatarOptions):
 
 
 @dataclass(frozen=True)
+class ExportLamSettings(AvatarOptions):
+    """Write an avatar as the folder that LAM's viewers animate with ARKit's blendshapes: LAM_WebRender, OpenAvatarChat, and
+    the npm package gsplat-flame-avatar-renderer.
+
+    For methods with splats. The viewers move splats by linear blendshapes and turn the whole head; a splat's colour, opacity,
+    size and direction do not change. Prints the size, and the PSNR relative to the avatar's own frames.
+    """
+
+    out: str
+    """Folder to write, or a file NAME.zip with the folder NAME, which the viewers load."""
+    capture: str | None = None
+    """Capture the avatar was trained on; its first frame determines the pose of the head from which colours are seen."""
+    dependent = (DependentOptions(("reader", "head", "cy", "set"), "capture"),)
+
+
+@dataclass(frozen=True)
 class CompactSettings(CaptureOptions):
     """Store an avatar of a native method by the common codec: quantised by visible effect, and compressed."""
 

@@ -208,8 +208,8 @@ def bake(
     rest = source.seen(source.rest)
     middle = rest.means.mean(axis=0)
     few = [camera_at(middle + AWAY_M * direction_of(*angles)) for angles in FEW_DIRECTIONS]
-    colors = [_colors(source, source.rest, camera) for camera in few]
-    weights = _weights(source, rest)
+    colors = [colors_from(source, source.rest, camera) for camera in few]
+    weights = skinning_weights(source, rest)
     harmonics = _harmonics(source, middle, degree, directions)
     progress(1, total, "at rest")
     morphs: dict[str, list[FloatArray]] = {
@@ -234,13 +234,14 @@ def bake(
     )
 
 
-def _colors(source: Source, pose: HeadPose, camera: Camera) -> FloatArray:
+def colors_from(source: Source, pose: HeadPose, camera: Camera) -> FloatArray:
+    """(N, 3) colours of the splats of a pose as a camera of the head's frame sees them."""
     colors = source.seen(pose, camera).colors
     assert colors is not None  # the camera is given
     return colors
 
 
-def _weights(source: Source, rest: Seen) -> FloatArray:
+def skinning_weights(source: Source, rest: Seen) -> FloatArray:
     """(N, 4) skinning weights: least squares over a turn of each joint about x and y."""
     moves = np.zeros((len(rest.means), len(JOINTS)))
     for joint in range(len(JOINTS)):
@@ -275,7 +276,9 @@ def _change(
     means = np.linalg.solve(linear, (seen.means - shift)[..., None])[..., 0] - rest.means
     left, _, right = np.linalg.svd(linear)
     relative = (left @ right).transpose(0, 2, 1) @ seen.rotations @ rest.rotations.transpose(0, 2, 1)
-    difference = np.mean([_colors(source, pose, camera) - base for camera, base in zip(few, colors)], axis=0)
+    difference = np.mean(
+        [colors_from(source, pose, camera) - base for camera, base in zip(few, colors)], axis=0
+    )
     return {
         "means": means,
         "turns": Rotation.from_matrix(relative).as_rotvec(),
@@ -290,7 +293,7 @@ def _harmonics(source: Source, middle: FloatArray, degree: int, directions: int)
 
     def radiance(direction: torch.Tensor) -> torch.Tensor:
         far = camera_at(middle + FAR_M * direction.numpy())
-        return torch.from_numpy(_colors(source, source.rest, far)).float()
+        return torch.from_numpy(colors_from(source, source.rest, far)).float()
 
     along = sphere(directions)
     weights = visibility(source.avatar.splats(source.rest), along.double().numpy() @ source.rotation.T)
@@ -316,7 +319,7 @@ def _turned(
     pose = source.pose(sliders, values)
     linear, _ = blended(weights, slider_motions(tuple(sliders), np.array(values), source.joints))
     camera = camera_at(middle + FAR_M * direction_of(0.0, 0.0))
-    found = _colors(source, pose, camera)
+    found = colors_from(source, pose, camera)
     ahead = np.tile([0.0, 0.0, -1.0], (len(found), 1))
     errors = []
     for along in (ahead, np.einsum("nji,nj->ni", linear, ahead)):

@@ -9,14 +9,14 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 
 from ....bench.contracts import Camera, Clip, FloatArray, HeadPose, Progress, no_progress
-from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE
+from ....bench.engine.stored import AVATAR_FILE, HEAD_FILE, StoredAvatar
 from ....bench.errors import InputError
 from ....bench.experiments.viewpoints import head_center
 from ....bench.expressions import expressions_of
@@ -35,7 +35,7 @@ from ...splats import rasterize
 from ...splats.reference import rotation_matrices
 from ..export import neutral_pose, open_splats
 from ..harmonics import direction_of, orbit_camera
-from ..settings import ExportHtmlSettings
+from ..settings import ExportHtmlSettings, ExportLamSettings
 from .bake import JOINTS, Moved, Slider, Source, WebAvatar, bake
 
 FORMAT = 1
@@ -309,30 +309,15 @@ def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) 
     """Write an avatar as one HTML file with sliders for expressions and joints."""
     out = Path(settings.out)
     check_writable(out, "--out")
-    stored, avatar = open_splats(settings)
-    head = read_shared_head(stored.folder)
-    rest, sequences, trained = neutral_pose(head), [], None
-    if settings.capture is not None:
-        clip = settings.open(settings.capture, progress)
-        first = clip.poses[min(key.timestep for key in clip.splits["train"])]
-        rest = replace(rest, rotation=first.rotation, translation=first.translation)
+    stored, head, source, clip = open_source(settings, progress)
+    sequences, trained = [], None
+    if clip is not None:
         sequences = recorded_sequences(clip, head.version)
         trained = training_images(clip, stored.record["resolution"])
-    shape, size = np.asarray(stored.record["shape"]), head.shape_basis.shape[2]
-    if len(shape) > size:
-        expected = f"at most {size} coefficients, as {HEAD_FILE} beside it has"
-        raise InputError(stored.folder / AVATAR_FILE, "shape", expected, str(len(shape)))
-    shaped = head.template + head.shape_basis[..., : len(shape)] @ shape
-    joints = np.asarray(head.joint_regressor @ shaped, np.float64)
-    source = Source(avatar, rest, joints[0], joints[1 : 1 + len(JOINTS)])
     poses = [pose for sequence in sequences for pose in sequence.poses]
     sliders = make_sliders(head, settings.expressions, poses)
     baked = bake(source, sliders, settings.degree, DIRECTIONS, progress)
-    low, high = np.quantile(baked.means, (0.005, 0.995), axis=0)
-    view = {
-        "distance": round(DISTANCE_BY_HEIGHT * float((high - low).max()), 4),
-        "target": ((low + high) / 2).round(5).tolist(),
-    }
+    view = view_around(baked.means)
     more = {
         "trained": trained,
         "sequences": packed_sequences(head, sliders, sequences),
@@ -356,6 +341,43 @@ def export_page(settings: ExportHtmlSettings, progress: Progress = no_progress) 
         text += f"\nThe capture was tracked with another head model than {head.version}; the page has no sequences to play."
     data = {"out": out, "splats": len(baked.means), "bytes": size, "psnr": losses, "sliders": names}
     return CommandResult(text, data | {"sequences": [sequence.name for sequence in sequences]})
+
+
+class Opened(NamedTuple):
+    """A stored avatar to sample."""
+
+    stored: StoredAvatar
+    head: HeadArrays
+    source: Source
+    clip: Clip | None
+    """The capture of the settings, if one is named."""
+
+
+def open_source(settings: ExportHtmlSettings | ExportLamSettings, progress: Progress) -> Opened:
+    """The avatar of a command in the neutral pose, its head as in the first training frame of a capture."""
+    stored, avatar = open_splats(settings)
+    head = read_shared_head(stored.folder)
+    rest, clip = neutral_pose(head), None
+    if settings.capture is not None:
+        clip = settings.open(settings.capture, progress)
+        first = clip.poses[min(key.timestep for key in clip.splits["train"])]
+        rest = replace(rest, rotation=first.rotation, translation=first.translation)
+    shape, size = np.asarray(stored.record["shape"]), head.shape_basis.shape[2]
+    if len(shape) > size:
+        expected = f"at most {size} coefficients, as {HEAD_FILE} beside it has"
+        raise InputError(stored.folder / AVATAR_FILE, "shape", expected, str(len(shape)))
+    shaped = head.template + head.shape_basis[..., : len(shape)] @ shape
+    joints = np.asarray(head.joint_regressor @ shaped, np.float64)
+    return Opened(stored, head, Source(avatar, rest, joints[0], joints[1 : 1 + len(JOINTS)]), clip)
+
+
+def view_around(means: FloatArray) -> dict[str, Any]:
+    """The view of `encode` in which (N, 3) splats fill the picture."""
+    low, high = np.quantile(means, (0.005, 0.995), axis=0)
+    return {
+        "distance": round(DISTANCE_BY_HEIGHT * float((high - low).max()), 4),
+        "target": ((low + high) / 2).round(5).tolist(),
+    }
 
 
 def training_images(clip: Clip, rule: ResolutionRule) -> dict[str, Any]:
@@ -430,10 +452,9 @@ def measure_losses(
     trials.append(("together", np.array([slider.high * (slider.name in names) for slider in page.sliders])))
     losses: dict[str, float] = {}
     for done, (group, values) in enumerate(trials):
-        lost = [
-            _psnr(source, page, source.pose(page.sliders, values), values, _camera(view, *angles))
-            for angles in VIEWS
-        ]
+        pose = source.pose(page.sliders, values)
+        cameras = [camera_of(view, *angles) for angles in VIEWS]
+        lost = [psnr(source, page.moved(values, camera.center), pose, camera) for camera in cameras]
         losses[group] = min(losses.get(group, np.inf), *lost)
         progress(done + 1, len(trials), f"comparing, {group}")
     return losses
@@ -448,17 +469,22 @@ def recorded_loss(
         "translation": source.rest.translation,
         "timestep": None,
     }
-    camera = _camera(view, *VIEWS[0])
-    return min(_psnr(source, page, replace(pose, **place), row, camera) for pose, row in zip(poses, values))
+    camera = camera_of(view, *VIEWS[0])
+    return min(
+        psnr(source, page.moved(row, camera.center), replace(pose, **place), camera)
+        for pose, row in zip(poses, values)
+    )
 
 
-def _psnr(source: Source, page: WebAvatar, pose: HeadPose, values: FloatArray, camera: Camera) -> float:
+def psnr(source: Source, moved: Moved, pose: HeadPose, camera: Camera) -> float:
+    """PSNR in dB of splats against the avatar in a pose, in a view of the head's frame, on white."""
     wanted = source.avatar.render(source.camera(camera), pose).rgb
-    error = float(np.square(draw(page.moved(values, camera.center), camera) - wanted).mean())
+    error = float(np.square(draw(moved, camera) - wanted).mean())
     return -10 * float(np.log10(max(error, 1e-12)))
 
 
-def _camera(view: Mapping[str, Any], azimuth: float, elevation: float) -> Camera:
+def camera_of(view: Mapping[str, Any], azimuth: float, elevation: float) -> Camera:
+    """A camera around the target of a view; angles in radians."""
     return orbit_camera(direction_of(azimuth, elevation), view["distance"], np.array(view["target"]), SIZE)
 
 
