@@ -240,7 +240,7 @@ def test_every_command_with_a_folder_to_write_locks_it():
     """All but those that lock for themselves, since they check first, and those whose --out is a file."""
     own = {"demo", "drive", "evaluate", "prepare nersemble", "run", "synth"}
     own |= {f"run {what}" for what in ("curve", "extremes", "reenact", "sweep")}
-    files = {f"export {form}" for form in ("glb", "html", "ply", "sog")}
+    files = {f"export {form}" for form in ("glb", "html", "lam", "ply", "sog")}
     files |= {"doctor bench", "doctor stress", "protocols", "report", "table"}
     for plugin in registry.discover("commands").values():
         spec = plugin.spec
