@@ -30,8 +30,6 @@ class FocalLength(NamedTuple):
     pixels: float
     residuals: FloatArray
     """(N,) root mean square distance of landmarks, pixels, at each tried focal length."""
-    tried: FloatArray
-    """(N,) pixels."""
 
     @property
     def source(self) -> str:
@@ -64,7 +62,7 @@ def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, s
         below, least, above = improbable[best - 1 : best + 2]
         step = 0.5 * (below - above) / (below - 2 * least + above)
         pixels = tried[best] * (tried[best + 1] / tried[best]) ** step
-    return FocalLength(float(pixels), residuals, tried)
+    return FocalLength(float(pixels), residuals)
 
 
 def _residual(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, focal: float) -> float:

@@ -49,8 +49,8 @@ def make_work_folder(folder: Path) -> None:
 USUAL_FOCAL, FOCAL_SPREAD = 2.5, 0.35
 """Prior of the focal length of a video: its median relative to the longer side of a frame, and the standard deviation of its logarithm.
 Published trackers of videos start at 1.5 to 4.9 times the longer side."""
-MASKLESS, BACKGROUND = "none", "background"
-"""Values of --masks that are no folder."""
+MASKLESS = "none"
+"""Value of --masks that is no folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +63,8 @@ class VideoOptions:
 
     masks: str = ""
     """Video: folder of masks instead, of the video's size, named by the number of the frame in the file (00000.png or 0000.jpg is
-    the first frame, also where --rate takes fewer); "background" for the difference from the empty room, which a static camera must show
-    for some seconds without a person; or "none" to keep the room behind the person, which then counts in every metric."""
+    the first frame, also where --rate takes fewer); or "none" to keep the room behind the person, which then counts in every
+    metric."""
 
     cut: Cut = "bust-line"
     """Video: part of the person that is replaced by background, since no head model explains it: all below a line through the

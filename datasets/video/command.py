@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 EMBEDDED = "2023"
 """Default head model of a video."""
-_FOCAL = {"pixels": Member("f", ()), "residuals": Member("f", ("N",)), "tried": Member("f", ("N",))}
+_FOCAL = {"pixels": Member("f", ()), "residuals": Member("f", ("N",))}
 
 
 class OpenedVideo(NamedTuple):
@@ -88,7 +88,7 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
                 for name, value in estimate_focal(clip.head, camera, detected, side)._asdict().items()
             },
         )
-        focal = FocalLength(float(stored["pixels"]), stored["residuals"], stored["tried"])
+        focal = FocalLength(float(stored["pixels"]), stored["residuals"])
         clip = video.with_focal(focal.pixels / video.view.scale)
         landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
     return OpenedVideo(
@@ -120,7 +120,6 @@ def _data(video: VideoClip, given: float | None, focal: FocalLength | None) -> d
             "without_face": [*video.without_face],
             "found_again": [one._asdict() for one in video.faces.again],
             "other_faces": video.faces.numbers[video.faces.others > 0].tolist(),
-            **({"unsure": [*video.unsure]} if video.unsure else {}),
             "focal": dict(zip(("pixels", "source"), _focal(video, given, focal))),
         }
     }
@@ -152,11 +151,6 @@ def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
         lines.append(
             f"  others     {listed(faces.numbers[faces.others > 0].tolist())} with a second face. The face that is largest in "
             f"frame {faces.numbers[faces.found][0]} is followed."
-        )
-    if video.unsure:
-        half, most = np.quantile(video.unsure, [0.5, 1.0])
-        lines.append(
-            f"  masks      {half:.0%} of the person's pixels are unsure (median of the frames), {most:.0%} in the worst frame"
         )
     return lines
 

@@ -33,15 +33,15 @@ def test_derivatives_are_those_of_the_head_model(eyelids):
     head = toy_head(16, eyelids=eyelids)
     rng, pose, shape = drawn(head)
     vertices = rng.choice(len(head.template), 40, replace=False)
-    found = PointRig.at_vertices(head, vertices, np.float64).linearised(shape, pose)
+    found = PointRig.at_vertices(head, vertices).linearised(shape, pose)
     given = torch.tensor(pose), torch.tensor(shape)
     chosen = torch.tensor(vertices)
     by_pose, by_shape = torch.autograd.functional.jacobian(
         lambda p, s: vertices_of(head, p, s)[chosen], given
     )
-    np.testing.assert_allclose(found.points, vertices_of(head, *given)[chosen], atol=1e-12)
-    np.testing.assert_allclose(found.by_pose, by_pose, atol=1e-12)
-    np.testing.assert_allclose(found.by_shape, by_shape, atol=1e-12)
+    np.testing.assert_allclose(found.points, vertices_of(head, *given)[chosen], atol=1e-6)
+    np.testing.assert_allclose(found.by_pose, by_pose, atol=1e-6)
+    np.testing.assert_allclose(found.by_shape, by_shape, atol=1e-6)
 
 
 def test_points_without_derivatives_are_the_same():

@@ -169,7 +169,6 @@ def test_a_video_becomes_a_capture_of_its_frames(settings, filmed, monkeypatch):
         ({"segmentation": "a.tflite"}, "found both"),
         ({"head": "2020"}, "head_model"),
         ({"masks": "nowhere"}, "nowhere"),
-        ({"masks": "background"}, "--masks background, found 1"),
         ({"longest": 1}, "frames for training"),
     ],
 )
@@ -303,7 +302,7 @@ def test_a_crop_holds_every_face_and_moves_the_camera():
 
 @pytest.mark.parametrize(("clear", "source"), [(True, "estimated"), (False, "assumed")])
 def test_a_focal_length_that_is_not_clear_is_said(settings, monkeypatch, clear, source):
-    found = FocalLength(300.0, np.array([2.0, 1.0, 2.0] if clear else [1.0, 1.0, 1.0]), np.ones(3))
+    found = FocalLength(300.0, np.array([2.0, 1.0, 2.0] if clear else [1.0, 1.0, 1.0]))
     monkeypatch.setattr(command, "estimate_focal", lambda *given: found)
     result = track_capture(settings(focal=None))
     assert result.data["video"]["focal"]["pixels"] == 300.0
