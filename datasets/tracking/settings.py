@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -55,7 +55,7 @@ MASKLESS = "none"
 
 @dataclass(frozen=True, kw_only=True)
 class VideoOptions:
-    """Options of `headbench track` for a video file; without effect on captures."""
+    """Options of `headbench track` for a video file; refused with captures."""
 
     segmentation: str = ""
     """Video: MediaPipe's selfie_segmentation.tflite, which finds the person in each frame; default without --masks: that of
@@ -90,6 +90,13 @@ class VideoOptions:
 
     held_out_frames: int | None = None
     """Video: number of last frames held out for self-reenactment; default: 350, or a quarter of fewer than 700."""
+
+    def check_capture(self, path: str) -> None:
+        """Raise `InputError` for an option that is given although the input is the capture ``path``."""
+        for option in fields(VideoOptions):
+            if getattr(self, option.name) != option.default:
+                expected = "a video file as the input, without which it has no effect"
+                raise InputError("command line", f"--{option.name.replace('_', '-')}", expected, path)
 
     def check_video(self) -> None:
         """Raise `ValueError` for a value out of range."""
