@@ -95,7 +95,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         source,
         notes=notes,
         store=work,
-        seconds=video.seconds if video else 0.0,
+        times=video.times if video else None,
         progress=progress,
     )
     if video is not None:

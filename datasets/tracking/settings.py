@@ -15,7 +15,7 @@ from ..options import CaptureOptions, Cut
 
 WORK = ".track"
 """Its name in the folder of ``--out``."""
-TRACKER_VERSION = "4"
+TRACKER_VERSION = "5"
 """Part of the key of intermediate results; raise it when code of the tracker or the reader of videos changes them."""
 _NOTE = "README.txt"
 _TEXT = """headbench track continues from these files after an interruption and deletes them at the end.

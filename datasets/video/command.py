@@ -41,8 +41,8 @@ class OpenedVideo(NamedTuple):
     """Name of the file of the landmark network."""
     numbers: list[int]
     """Numbers in the file of the frames of the clip."""
-    seconds: float
-    """Between timesteps of the clip."""
+    times: dict[int, float]
+    """Seconds at which the timesteps of the clip are."""
     data: dict[str, Any]
     lines: list[str]
 
@@ -91,13 +91,14 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
         focal = FocalLength(float(stored["pixels"]), stored["residuals"])
         clip = video.with_focal(focal.pixels / video.view.scale)
         landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
+    numbers = video.faces.numbers[video.faces.found].tolist()
     return OpenedVideo(
         clip,
         video.view,
         landmarks,
         network.name,
-        video.faces.numbers[video.faces.found].tolist(),
-        1 / min(settings.rate, video.info.rate),
+        numbers,
+        {timestep: number / video.info.rate for timestep, number in enumerate(numbers)},
         _data(video, settings.focal, focal),
         _lines(video, settings.focal, focal),
     )
