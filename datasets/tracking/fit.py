@@ -321,11 +321,12 @@ class Fitter:
         """Steps on colours of points, landmarks and outlines at the blurs of ``levels``, by default `LEVELS`, in the final pass `LAST`.
 
         ``stack`` holds the images of all timesteps, the cameras of each together. ``scalp``: Whether the outline of the scalp
-        counts, which the static offset moves to that of the hair. ``last``: Inputs of the final pass, in
-        which the head model has no shape basis.
+        counts, which the static offset moves to that of the hair. ``last``: Inputs of the final pass, in which
+        the head model has no shape basis.
         """
         texture, motion = last or (None, None)
-        levels = levels or (LEVELS if last is None else [LAST])
+        if levels is None:
+            levels = LEVELS if last is None else [LAST]
         if motion is not None:
             state = state._replace(poses=continuous(np.vstack([motion.before, state.poses]))[1:])
         vertices = self.vertices
