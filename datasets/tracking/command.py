@@ -67,6 +67,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         clip = video.clip
     else:
         video, clip = None, settings.open(settings.capture, progress)
+        settings.check_capture(settings.capture)
         check_apart(clip, out)
         teacher = settings.open(settings.embedding, progress) if settings.embedding else None
     exact = settings.open(settings.against, progress) if settings.against else None
@@ -94,7 +95,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         source,
         notes=notes,
         store=work,
-        seconds=video.seconds if video else 0.0,
+        times=video.times if video else None,
         progress=progress,
     )
     if video is not None:

@@ -1,9 +1,8 @@
-"""Gauss-Newton steps for the poses of all timesteps and one shape: normal equations with an arrowhead matrix, or with the shape
-fixed a chain of timesteps."""
+"""Gauss-Newton steps for the poses of all timesteps and one shape: normal equations with an arrowhead matrix, or without
+shape a chain of timesteps."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -33,6 +32,23 @@ class HeadPrior(NamedTuple):
     """(D,) standard deviations around 0."""
     shape: FloatArray
     """(S,) the same."""
+
+
+class MotionPrior(NamedTuple):
+    """Expected differences between the poses of consecutive timesteps."""
+
+    before: FloatArray
+    """(D,) pose before the first one, which is kept."""
+    deviations: FloatArray
+    """(T, D) standard deviations of the differences from the pose before; infinity for none."""
+
+    @classmethod
+    def of(cls, before: FloatArray, seconds: FloatArray) -> MotionPrior:
+        """The prior by `SPEED`. ``seconds``: (T,) since the timestep before."""
+        angles, translation, coefficient = SPEED
+        count = len(before) - len(angles) - 3
+        usual = np.array([*angles, *(translation,) * 3, *(coefficient,) * count])
+        return cls(before, seconds[:, None] * usual)
 
 
 class NormalEquations:
@@ -69,16 +85,16 @@ class NormalEquations:
         self._matrices[timestep] += jacobian.T @ weighted
         self._rights[timestep] += weighted.T @ residual
 
-    def link(self, poses: FloatArray, deviations: FloatArray) -> None:
-        """Expect consecutive poses (T, D) to differ by standard deviations (T - 1, D); infinity for none."""
-        stiffness = deviations**-2.0
-        pull = stiffness * np.diff(poses, axis=0)
+    def link(self, poses: FloatArray, motion: MotionPrior) -> None:
+        """Expect each of the poses (T, D) to differ little from the one before."""
+        stiffness = motion.deviations**-2.0
+        pull = stiffness * np.diff(poses, axis=0, prepend=motion.before[None])
         pose = np.arange(self._split)
-        self._links = stiffness
-        self._matrices[:-1, pose, pose] += stiffness
-        self._matrices[1:, pose, pose] += stiffness
-        self._rights[:-1, pose] += pull
-        self._rights[1:, pose] -= pull
+        self._links = stiffness[1:]
+        self._matrices[:, pose, pose] += stiffness
+        self._matrices[:-1, pose, pose] += stiffness[1:]
+        self._rights[:, pose] -= pull
+        self._rights[:-1, pose] += pull[1:]
 
     def step(self, state: HeadState, prior: HeadPrior, damping: float = 1e-6) -> HeadState:
         """The state after a step with the prior. ``damping``: Fraction of the diagonal that is added to it
@@ -101,8 +117,8 @@ class NormalEquations:
         matrices[:, diagonal, diagonal] += (
             stiffness + damping * matrices[:, diagonal, diagonal] + 1e-9 + ~free
         )
-        if self._links is not None:  # the shape is fixed
-            return state._replace(poses=state.poses + _chain(matrices, rights[:, :split], self._links))
+        if self._links is not None:  # there is no shape
+            return state._replace(poses=state.poses + _chain(matrices, rights, self._links))
         own, mixed, corner = (
             matrices[:, :split, :split],
             matrices[:, :split, split:],
@@ -116,12 +132,12 @@ class NormalEquations:
 
 
 def _chain(matrices: FloatArray, rights: FloatArray, links: FloatArray) -> FloatArray:
-    """(T, D) solution of systems of which each is linked with the next one. ``matrices``: (T, D or more, the same), symmetric.
+    """(T, D) solution of systems of which each is linked with the next one. ``matrices``: (T, D, D), symmetric.
     ``links``: (T - 1, D) negative derivatives between the same parameters of consecutive timesteps."""
     count, size = rights.shape
     bands = np.zeros((size + 1, count * size))
     for below in range(size):
-        diagonal = np.diagonal(matrices[:, :size, :size], -below, 1, 2)  # (T, size - below)
+        diagonal = np.diagonal(matrices, -below, 1, 2)  # (T, size - below)
         bands[below].reshape(count, size)[:, : size - below] = diagonal
     bands[size, : (count - 1) * size] = -links.ravel()
     return np.asarray(solveh_banded(bands, rights.ravel(), lower=True)).reshape(count, size)
@@ -137,10 +153,3 @@ def continuous(poses: FloatArray) -> FloatArray:
         if np.linalg.norm(other - before[:3]) < np.linalg.norm(after[:3] - before[:3]):
             after[:3] = other
     return result
-
-
-def motion_spread(timesteps: Sequence[int], seconds: float, size: int) -> FloatArray:
-    """(T - 1, D) standard deviations of the differences between poses of consecutive timesteps, ``seconds`` apart."""
-    angles, translation, coefficient = SPEED
-    usual = np.array([*angles, *(translation,) * 3, *(coefficient,) * (size - len(angles) - 3)])
-    return np.asarray(seconds * np.diff(timesteps)[:, None] * usual)

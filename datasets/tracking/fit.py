@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from ...bench.contracts import BoolArray, FloatArray, HeadAsset, IntArray, Progress, no_progress
 from ...bench.errors import InputError
 from ..head.arrays import HeadArrays
-from .equations import HeadPrior, HeadState, NormalEquations, continuous
+from .equations import HeadPrior, HeadState, MotionPrior, NormalEquations, continuous
 from .landmarks import ImageLandmarks, spread_vertices
 from .outline import Gaps, MeshOutline, Outline, OutlinePoints, gaps, static_offset
 from .rig import (
@@ -32,6 +32,11 @@ from .rig import (
 def with_offset(head: HeadArrays, offset: FloatArray) -> HeadArrays:
     """The head model with a static offset (V, 3) in its template."""
     return replace(head, template=np.asarray(head.template + offset, head.template.dtype))
+
+
+def with_shape(head: HeadArrays, shape: FloatArray) -> HeadArrays:
+    """The head model with a shape (S,) in its template instead of a shape basis: one that is kept."""
+    return replace(with_offset(head, head.shape_basis @ shape), shape_basis=head.shape_basis[:, :, :0])
 
 
 ANGLE_SPREAD = (np.inf,) * 3 + (0.15,) * 3 + (0.3, 0.03, 0.02) + (0.2, 0.3, 0.02) * 2
@@ -60,7 +65,8 @@ class BlurLevel(NamedTuple):
     """Standard deviation on the head, millimetres; at least `SHARPEST` pixels."""
     steps: int
     tolerance: float
-    """Squared difference of colours at which a weight is a quarter, relative to the usual one."""
+    """Squared difference of colours at which a weight is a quarter, relative to the usual one. All weights of colours are divided by
+    it, so that they rise 16-fold over the levels."""
     landmarks: float
     """Weight of a landmark beside the prior, divided among the cameras."""
     reach: float = 1.0
@@ -136,6 +142,15 @@ class OutlinedView(NamedTuple):
     """(n, 2) outward, in the image."""
 
 
+class LastPass(NamedTuple):
+    """Inputs of the final pass."""
+
+    texture: FloatArray
+    """(P, 3) colours of the sampled vertices."""
+    motion: MotionPrior | None
+    """Of consecutive timesteps, where their times are known."""
+
+
 class Fitted(NamedTuple):
     """Result of a fit."""
 
@@ -162,24 +177,23 @@ class Fitter:
     outlines: Sequence[Outline | None] = ()
     """Outlines of the subject in the images of T x C frames; none without masks."""
 
-    def _prior(self, keep_shape: bool) -> HeadPrior:
+    def _prior(self) -> HeadPrior:
         """Weak prior of all parameters."""
         columns = PoseColumns.of(self.head)
         free = [np.inf] * 3
         coefficients = [1.0] * columns.expression_size + [0.5] * columns.eyelid_size
-        shape = np.full(self.head.shape_basis.shape[2], 0.0 if keep_shape else SHAPE_SPREAD)
+        shape = np.full(self.head.shape_basis.shape[2], SHAPE_SPREAD)
         return HeadPrior(np.array([*ANGLE_SPREAD, *free, *coefficients]), shape)
 
-    def start(self, shape: FloatArray | None = None) -> HeadState:
-        """A shape, by default the mean, in the rigid pose of the landmarks of one camera at each timestep. Of the
+    def start(self) -> HeadState:
+        """The mean shape in the rigid pose of the landmarks of one camera at each timestep. Of the
         cameras that saw most landmarks it is the one whose pose fits the landmarks of all cameras best."""
         columns = PoseColumns.of(self.head)
         poses = np.zeros((len(self.landmarks.pixels), columns.size))
-        shape = np.zeros(self.head.shape_basis.shape[2]) if shape is None else shape
+        shape = np.zeros(self.head.shape_basis.shape[2])
         rig = self.landmark_rig()
         rest = rig.points(shape, poses[0]).astype(np.float64)
-        neutral = np.asarray(self.head.template + self.head.shape_basis @ shape, np.float64)
-        root = np.asarray(self.head.joint_regressor[0], np.float64) @ neutral
+        root = np.asarray(self.head.joint_regressor[0], np.float64) @ self.head.template
         last = np.zeros(6)
         for row, pixels in enumerate(self.landmarks.pixels):
             seen = np.isfinite(pixels[..., 0])
@@ -274,11 +288,9 @@ class Fitter:
         weight = PAIR_WEIGHT / (scale * (1 + square / (ROBUST * scale) ** 2)) ** 2
         equations.add_residuals(row, rows.reshape(-1, rows.shape[2]), np.repeat(weight, 2), residual.ravel())
 
-    def fit_landmarks(
-        self, state: HeadState, *, keep_shape: bool = False, weight: float = LEVELS[0].landmarks
-    ) -> HeadState:
+    def fit_landmarks(self, state: HeadState, weight: float = LEVELS[0].landmarks) -> HeadState:
         """Steps on the landmarks alone, the first of the rigid pose only."""
-        rig, prior = self.landmark_rig(), self._prior(keep_shape)
+        rig, prior = self.landmark_rig(), self._prior()
         still = HeadPrior(np.where(np.isinf(prior.pose), np.inf, 0.0), np.zeros(len(prior.shape)))
         for step in range(_RIGID + _STEPS):
             equations = NormalEquations(state)
@@ -286,13 +298,10 @@ class Fitter:
             state = equations.step(state, still if step < _RIGID else prior, 1e-3)
         return state
 
-    def fit(
-        self, state: HeadState, stack: FrameStack, offset: FloatArray | None, progress: Progress = no_progress
+    def fit_subject(
+        self, state: HeadState, stack: FrameStack, progress: Progress = no_progress
     ) -> tuple[Fitted, FloatArray]:
-        """Poses from those of the landmarks, with ``offset``, which the head model has, and its shape; or if there is none, with a
-        new shape and offset (V, 3), metres. Returns the offset, too."""
-        if offset is not None:
-            return self.fit_colours(state, stack, levels=LEVELS, keep_shape=True, progress=progress), offset
+        """Shape, poses from those of the landmarks, and a static offset (V, 3), metres, that the head model does not have yet."""
         state = self.fit_colours(state, stack, levels=LEVELS[:COARSE], scalp=False, progress=progress).state
         offset = self.fit_offset(state)
         fine = replace(self, head=with_offset(cast(HeadArrays, self.head), offset))
@@ -304,26 +313,26 @@ class Fitter:
         state: HeadState,
         stack: FrameStack,
         *,
-        levels: Sequence[BlurLevel] = (),
-        keep_shape: bool = False,
+        levels: Sequence[BlurLevel] | None = None,
         scalp: bool = True,
-        last: tuple[FloatArray, FloatArray | None] | None = None,
+        last: LastPass | None = None,
         progress: Progress = no_progress,
     ) -> Fitted:
-        """Steps on colours of points, landmarks and outlines at the blurs of ``levels``.
+        """Steps on colours of points, landmarks and outlines at the blurs of ``levels``, by default `LEVELS`, in the final pass `LAST`.
 
         ``stack`` holds the images of all timesteps, the cameras of each together. ``scalp``: Whether the outline of the scalp
-        counts, which the static offset moves to that of the hair. ``last``: In the final pass, the vertices' colours (P, 3)
-        and `motion_spread`; the shape is kept.
+        counts, which the static offset moves to that of the hair. ``last``: Inputs of the final pass, in which
+        the head model has no shape basis.
         """
         texture, motion = last or (None, None)
-        levels, keep_shape = (levels, keep_shape) if last is None else ([LAST], True)
+        if levels is None:
+            levels = LEVELS if last is None else [LAST]
         if motion is not None:
-            state = state._replace(poses=continuous(state.poses))
+            state = state._replace(poses=continuous(np.vstack([motion.before, state.poses]))[1:])
         vertices = self.vertices
         rig = PointRig.at_vertices(self.head, vertices)
         mesh = PointRig.at_vertices(self.head, np.arange(len(self.head.template)))
-        marks, prior = self.landmark_rig(), self._prior(keep_shape)
+        marks, prior = self.landmark_rig(), self._prior()
         scale = self._pixels_per_millimetre(mesh, state)
         alone = len(self.views.cameras) == 1
         total, done = sum(level.steps for level in levels), 0

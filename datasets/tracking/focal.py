@@ -7,15 +7,18 @@ from typing import NamedTuple
 import numpy as np
 
 from ...bench.contracts import Camera, FloatArray, HeadAsset
+from ...bench.errors import InputError
+from ..head.rotations import rotation_of
 from .equations import NormalEquations
 from .fit import Fitter
-from .landmarks import ImageLandmarks
+from .landmarks import ImageLandmarks, spread_vertices
 from .rig import Views
 from .settings import FOCAL_SPREAD, USUAL_FOCAL
 
 TRIED = tuple(np.geomspace(0.8, 6.0, 10))
 """Focal lengths relative to the longer side of the picture."""
-FRAMES = 16
+FRAMES, TURNED = 16, 8
+"""Number of frames that are fitted, and how many of them are those whose rotations of the head differ most."""
 WEIGHT = 1.0
 """Weight of a landmark relative to the prior. With that of tracking, residuals due to the prior would hide perspective."""
 CLEAR = 1.02
@@ -30,8 +33,6 @@ class FocalLength(NamedTuple):
     pixels: float
     residuals: FloatArray
     """(N,) root mean square distance of landmarks, pixels, at each tried focal length."""
-    tried: FloatArray
-    """(N,) pixels."""
 
     @property
     def source(self) -> str:
@@ -52,7 +53,9 @@ def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, s
     ``camera``, before it was cropped.
     """
     sample = landmarks.of(landmarks.seen)
-    sample = sample.of(np.unique(np.linspace(0, len(sample.pixels) - 1, FRAMES).astype(int)))
+    turns = rotation_of(_fitter(head, camera, sample, side * USUAL_FOCAL).start().poses[:, :3]).as_matrix()
+    even = np.linspace(0, len(turns) - 1, FRAMES - TURNED).astype(int)
+    sample = sample.of(np.union1d(even, spread_vertices(turns.reshape(-1, 9), TURNED)))
     tried = side * np.array(TRIED)
     residuals = np.array([_residual(head, camera, sample, focal) for focal in tried])
     improbable = INDEPENDENT * np.log(residuals) + (np.log(TRIED) - np.log(USUAL_FOCAL)) ** 2 / (
@@ -64,15 +67,24 @@ def estimate_focal(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, s
         below, least, above = improbable[best - 1 : best + 2]
         step = 0.5 * (below - above) / (below - 2 * least + above)
         pixels = tried[best] * (tried[best + 1] / tried[best]) ** step
-    return FocalLength(float(pixels), residuals, tried)
+    return FocalLength(float(pixels), residuals)
 
 
-def _residual(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, focal: float) -> float:
+def _fitter(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, focal: float) -> Fitter:
     K = np.array(camera.K, np.float64)
     K[0, 0] = K[1, 1] = focal
     views = Views([Camera(camera.id, camera.width, camera.height, K, camera.world_to_camera)])
-    fitter = Fitter(head, views, landmarks, np.zeros(0, np.int64))
+    return Fitter(head, views, landmarks, np.zeros(0, np.int64))
+
+
+def _residual(head: HeadAsset, camera: Camera, landmarks: ImageLandmarks, focal: float) -> float:
+    """Of the frames whose landmarks are not left out."""
+    fitter = _fitter(head, camera, landmarks, focal)
     state = fitter.fit_landmarks(fitter.start(), weight=WEIGHT)
     equations = NormalEquations(state)
     distances = fitter.add_landmarks(equations, fitter.landmark_rig(), state, WEIGHT)
-    return float(np.sqrt(np.mean(distances**2)))
+    used = distances[distances > 0]
+    if not len(used):
+        where, expected = f"landmarks at a focal length of {focal:.0f} pixels", "some that fit the head model"
+        raise InputError(where, "", expected, "none", "Give --focal.")
+    return float(np.sqrt(np.mean(used**2)))

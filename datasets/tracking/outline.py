@@ -39,14 +39,21 @@ REACH = 8.0
 
 
 def outline_of(mask: ByteArray) -> Outline | None:
-    """The outline of the largest connected part of an (H, W) 8-bit mask; None without one."""
-    contours = find_contours(mask.astype(np.float32), 127.5)
+    """The outline of the largest connected part of an (H, W) 8-bit mask, without its holes; None without one. It consists of
+    several contours where borders of the image cut the part."""
+    inside = mask > 127
+    borders = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    part = np.zeros_like(mask)
+    if borders:
+        cv2.drawContours(part, [max(borders, key=cv2.contourArea)], -1, 255, cv2.FILLED)
+    levels = np.where(inside == (part > 0), mask, part).astype(np.float32)
+    contours = find_contours(levels, 127.5)
     if not contours:
         return None
-    pixels = max(contours, key=len)[:, ::-1] + 0.5
+    pixels = np.concatenate(contours)[:, ::-1] + 0.5
     size = np.array(mask.shape[::-1])
     pixels = pixels[((pixels > BORDER) & (pixels < size - BORDER)).all(axis=1)]
-    blurred = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _SMOOTH)
+    blurred = cv2.GaussianBlur(levels, (0, 0), _SMOOTH)
     slopes = [
         cv2.Sobel(blurred, cv2.CV_32F, *axes)[*np.floor(pixels[:, ::-1]).astype(int).T]
         for axes in ((1, 0), (0, 1))

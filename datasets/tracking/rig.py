@@ -306,34 +306,32 @@ class _Posed(NamedTuple):
 
 class PointRig:
     """P points on a head model. ``head``: Head model in FLAME's layout. ``corners``: (P, 3) vertices of each point.
-    ``weights``: (P, 3) their shares, rows sum to 1. ``dtype``: Type of the points and of the derivatives."""
+    ``weights``: (P, 3) their shares, rows sum to 1."""
 
-    def __init__(self, head: HeadAsset, corners: IntArray, weights: FloatArray, dtype: Any = np.float32):
+    def __init__(self, head: HeadAsset, corners: IntArray, weights: FloatArray):
         def mixed(values: Any) -> FloatArray:
             array = np.asarray(values, np.float64)
             return np.einsum("pk,pk...->p...", weights, array[corners])
 
         self.columns = PoseColumns.of(head)
-        self.shape_size = head.shape_basis.shape[2]
-        self._dtype = dtype
         self._parents = [int(parent) for parent in head.parents]
         self._template = mixed(head.template)
         # Expression, then shape: both move the unposed points and the joints linearly.
         basis = np.concatenate([mixed(head.expression_basis), mixed(head.shape_basis)], axis=2)
-        self._basis = basis.astype(dtype)
-        self._correctives = mixed(head.pose_basis).astype(dtype)
-        self._skin = mixed(head.skinning_weights).astype(dtype)
-        self._lids = None if head.eyelid_basis is None else mixed(head.eyelid_basis).astype(dtype)
+        self._basis = basis.astype(np.float32)
+        self._correctives = mixed(head.pose_basis).astype(np.float32)
+        self._skin = mixed(head.skinning_weights).astype(np.float32)
+        self._lids = None if head.eyelid_basis is None else mixed(head.eyelid_basis).astype(np.float32)
         regressor = np.asarray(head.joint_regressor, np.float64)
         self._rest = regressor @ head.template
         bases = np.concatenate([head.expression_basis, head.shape_basis], axis=2)
         self._joint_basis = np.tensordot(regressor, np.asarray(bases, np.float64), 1)
 
     @classmethod
-    def at_vertices(cls, head: HeadAsset, vertices: IntArray, dtype: Any = np.float32) -> PointRig:
+    def at_vertices(cls, head: HeadAsset, vertices: IntArray) -> PointRig:
         """The points are vertices."""
         weights = np.tile([1.0, 0.0, 0.0], (len(vertices), 1))
-        return cls(head, np.repeat(vertices[:, None], 3, axis=1), weights, dtype)
+        return cls(head, np.repeat(vertices[:, None], 3, axis=1), weights)
 
     def mixed(self, corners: IntArray, weights: FloatArray) -> PointRig:
         """A rig of n mixtures of k of the points. ``corners``: (n, k). ``weights``: (n, k), rows sum to 1."""
@@ -356,45 +354,47 @@ class PointRig:
         count = len(points)
 
         linear = turns @ self._basis
-        by_coefficient = joints.shifts_by_coefficient.reshape(JOINTS, -1).astype(self._dtype)
+        by_coefficient = joints.shifts_by_coefficient.reshape(JOINTS, -1).astype(np.float32)
         linear += (self._skin @ by_coefficient).reshape(linear.shape)
-        by_pose = np.zeros((count, 3, columns.size), self._dtype)
+        by_pose = np.zeros((count, 3, columns.size), np.float32)
         by_pose[:, 0, ANGLES] = by_pose[:, 1, ANGLES + 1] = by_pose[:, 2, ANGLES + 2] = 1
         by_pose[:, :, ANGLES + 3 : ANGLES + 3 + expressions] = linear[:, :, :expressions]
         # Skinning: sum_j w_j (dR_j x + do_j), with x extended by 1 so that both are one product.
-        extended = np.concatenate([unposed, np.ones((count, 1), self._dtype)], axis=1)
+        extended = np.concatenate([unposed, np.ones((count, 1), np.float32)], axis=1)
         weighted = (self._skin[:, :, None] * extended[:, None]).reshape(count, -1)  # (P, 4 J)
         motion = np.concatenate(
             [joints.turns_by_angle, joints.shifts_by_angle[..., None]], axis=3
         )  # (3 J, J, 3, 4)
-        motion = motion.transpose(1, 3, 2, 0).reshape(4 * JOINTS, -1).astype(self._dtype)
+        motion = motion.transpose(1, 3, 2, 0).reshape(4 * JOINTS, -1).astype(np.float32)
         by_pose[:, :, :ANGLES] = (weighted @ motion).reshape(count, 3, ANGLES)
-        entries = derivatives[1:].reshape(JOINTS - 1, 9, 3).astype(self._dtype)
+        entries = derivatives[1:].reshape(JOINTS - 1, 9, 3).astype(np.float32)
         for joint in range(1, JOINTS):
             bent = self._correctives[:, :, 9 * joint - 9 : 9 * joint] @ entries[joint - 1]
             by_pose[:, :, 3 * joint : 3 * joint + 3] += turns @ bent
         if self._lids is not None:
-            closed = self._lids @ pose[columns.size - columns.eyelid_size :].astype(self._dtype)
+            closed = self._lids @ pose[columns.size - columns.eyelid_size :].astype(np.float32)
             by_pose[:, :, columns.size - columns.eyelid_size :] = (
-                joints.turns[1].astype(self._dtype) @ self._lids
+                joints.turns[1].astype(np.float32) @ self._lids
             )
-            turned = joints.turns_by_angle[:6, 1].astype(self._dtype)  # by root and neck
+            turned = joints.turns_by_angle[:6, 1].astype(np.float32)  # by root and neck
             by_pose[:, :, :6] += np.einsum("kij,pj->pik", turned, closed)
         return PosedPoints(points, by_pose, linear[:, :, expressions:])
 
     def _posed(self, shape: FloatArray, pose: FloatArray) -> _Posed:
-        start, kind = ANGLES + 3, self._dtype
+        start = ANGLES + 3
         coefficients = np.concatenate([pose[start : start + self.columns.expression_size], shape])
         joints, rotations, derivatives = self._motions(coefficients, pose)
-        feature = (rotations[1:] - np.eye(3)).ravel().astype(kind)
-        blend = self._basis @ coefficients.astype(kind) + self._correctives @ feature
-        unposed = self._template.astype(kind) + blend
-        turns = (self._skin @ joints.turns.reshape(JOINTS, 9).astype(kind)).reshape(-1, 3, 3)
-        shifts = self._skin @ joints.shifts.astype(kind) + pose[self.columns.translation].astype(kind)
+        feature = (rotations[1:] - np.eye(3)).ravel().astype(np.float32)
+        blend = self._basis @ coefficients.astype(np.float32) + self._correctives @ feature
+        unposed = self._template.astype(np.float32) + blend
+        turns = (self._skin @ joints.turns.reshape(JOINTS, 9).astype(np.float32)).reshape(-1, 3, 3)
+        shifts = self._skin @ joints.shifts.astype(np.float32) + pose[self.columns.translation].astype(
+            np.float32
+        )
         points = (turns @ unposed[..., None])[..., 0] + shifts
         if self._lids is not None:
-            closed = self._lids @ pose[self.columns.size - self.columns.eyelid_size :].astype(kind)
-            points = points + closed @ joints.turns[1].T.astype(kind)
+            closed = self._lids @ pose[self.columns.size - self.columns.eyelid_size :].astype(np.float32)
+            points = points + closed @ joints.turns[1].T.astype(np.float32)
         return _Posed(points, unposed, turns, joints, derivatives)
 
     def _motions(self, coefficients: FloatArray, pose: FloatArray) -> tuple[_Joints, FloatArray, FloatArray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,7 +15,7 @@ from ..options import CaptureOptions, Cut
 
 WORK = ".track"
 """Its name in the folder of ``--out``."""
-TRACKER_VERSION = "4"
+TRACKER_VERSION = "5"
 """Part of the key of intermediate results; raise it when code of the tracker or the reader of videos changes them."""
 _NOTE = "README.txt"
 _TEXT = """headbench track continues from these files after an interruption and deletes them at the end.
@@ -49,13 +49,13 @@ def make_work_folder(folder: Path) -> None:
 USUAL_FOCAL, FOCAL_SPREAD = 2.5, 0.35
 """Prior of the focal length of a video: its median relative to the longer side of a frame, and the standard deviation of its logarithm.
 Published trackers of videos start at 1.5 to 4.9 times the longer side."""
-MASKLESS, BACKGROUND = "none", "background"
-"""Values of --masks that are no folder."""
+MASKLESS = "none"
+"""Value of --masks that is no folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VideoOptions:
-    """Options of `headbench track` for a video file; without effect on captures."""
+    """Options of `headbench track` for a video file; refused with captures."""
 
     segmentation: str = ""
     """Video: MediaPipe's selfie_segmentation.tflite, which finds the person in each frame; default without --masks: that of
@@ -63,8 +63,8 @@ class VideoOptions:
 
     masks: str = ""
     """Video: folder of masks instead, of the video's size, named by the number of the frame in the file (00000.png or 0000.jpg is
-    the first frame, also where --rate takes fewer); "background" for the difference from the empty room, which a static camera must show
-    for some seconds without a person; or "none" to keep the room behind the person, which then counts in every metric."""
+    the first frame, also where --rate takes fewer); or "none" to keep the room behind the person, which then counts in every
+    metric."""
 
     cut: Cut = "bust-line"
     """Video: part of the person that is replaced by background, since no head model explains it: all below a line through the
@@ -90,6 +90,13 @@ class VideoOptions:
 
     held_out_frames: int | None = None
     """Video: number of last frames held out for self-reenactment; default: 350, or a quarter of fewer than 700."""
+
+    def check_capture(self, path: str) -> None:
+        """Raise `InputError` for an option that is given although the input is the capture ``path``."""
+        for option in fields(VideoOptions):
+            if getattr(self, option.name) != option.default:
+                expected = "a video file as the input, without which it has no effect"
+                raise InputError("command line", f"--{option.name.replace('_', '-')}", expected, path)
 
     def check_video(self) -> None:
         """Raise `ValueError` for a value out of range."""

@@ -27,8 +27,8 @@ from ..ga.writer import save_npz
 from ..head.geometry import fit_sphere
 from ..head.model import PosedSubject
 from ..open import open_clip
-from .equations import HeadState, motion_spread
-from .fit import Fitter, sampled_vertices, with_offset
+from .equations import HeadState, MotionPrior
+from .fit import Fitter, LastPass, sampled_vertices, with_offset, with_shape
 from .landmarks import ImageLandmarks, landmark_source
 from .outline import outline_of
 from .rig import FrameStack, PoseColumns, Views, outliers
@@ -190,7 +190,7 @@ def track(
     *,
     notes: Mapping[str, Any] | None = None,
     store: Path | None = None,
-    seconds: float = 0.0,
+    times: Mapping[int, float] | None = None,
     progress: Progress = no_progress,
 ) -> Tracked:
     """Estimate shape, static offset and poses from images; recorded as a step.
@@ -198,8 +198,8 @@ def track(
     Timesteps without landmarks, and those whose fit remains an outlier, are not in the clip that is returned.
 
     Neither shape, poses nor static offset of the clip are used, other than by ``source``. The shape is estimated with the
-    first timesteps, spread over the clip, and kept for the others. ``seconds``: Time
-    between timesteps, where it is known: neighbours then differ little.
+    first timesteps, spread over the clip, and kept for the others. ``times``: Seconds at which
+    timesteps are, where they are known: neighbours then differ little.
 
     ``cameras``: Cameras whose images are used; one is enough. ``source``: Finds landmarks. ``notes``: Recorded with the
     step. ``store``: Folder that keeps the fit of every part, which a later call with the same images and landmarks does not
@@ -242,7 +242,7 @@ def track(
         marks = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in refitted]))
         part_progress = partial(_part_progress, progress, blocks + number, blocks + len(parts))
         fits.fit(f"again-{number:05d}", refitted, marks, wrong, part_progress)
-    fits.finish({timestep: pixels[timestep] for timestep in fits.poses}, landmarks, seconds, progress)
+    fits.finish({timestep: pixels[timestep] for timestep in fits.poses}, landmarks, times, progress)
     last = fits.outliers()
     kept = sorted({*fits.poses} - last)
     report = TrackingReport(
@@ -325,8 +325,9 @@ class _Fits:
         else:
             seen = [[one.id, one.width, one.height, one.K, one.world_to_camera] for one in self.views.cameras]
             heads = self.clip.fingerprint, self.clip.head.fingerprint()
+            ending = (last.texture, *(last.motion or ())) if last else ()
             mark = digest(
-                TRACKER_VERSION, *heads, seen, part, *landmarks, self.shape, self.offset, start, *(last or ())
+                TRACKER_VERSION, *heads, seen, part, *landmarks, self.shape, self.offset, start, *ending
             )
             file = self.store / f"{name}.npz"
             fitted = cached_arrays(file, mark, _PART, lambda: _fit_block(*given), {"T": len(part)})
@@ -339,10 +340,14 @@ class _Fits:
                 self.poses[timestep], self.residuals[timestep] = pose, (residual[0], residual[1])
 
     def finish(
-        self, pixels: Mapping[int, FloatArray], landmarks: ImageLandmarks, seconds: float, progress: Progress
+        self,
+        pixels: Mapping[int, FloatArray],
+        landmarks: ImageLandmarks,
+        times: Mapping[int, float] | None,
+        progress: Progress,
     ) -> None:
-        """Fit consecutive timesteps together, with the colours of all parts and small differences between neighbours. Timesteps
-        that become outliers keep their former poses."""
+        """Fit consecutive timesteps together, with the colours of all parts and small differences between neighbours, also from
+        one part to the next. Timesteps that become outliers keep their former poses."""
         known = sorted({*self.poses} - self.outliers())
         former = {timestep: (self.poses[timestep], self.residuals[timestep]) for timestep in known}
         total = np.maximum(np.sum([one[:, 3:] for one in self.textures], axis=0), 1e-9)
@@ -352,7 +357,13 @@ class _Fits:
         for number, part in enumerate(parts):
             marks = landmarks._replace(pixels=np.stack([pixels[timestep] for timestep in part]))
             part_progress = partial(_part_progress, progress, number, len(parts))
-            self.fit(f"last-{number:05d}", part, marks, part, part_progress, LastPass(texture, seconds))
+            motion = None
+            if times is not None:
+                before = parts[number - 1][-1] if number else part[0]
+                seconds = np.diff([times[timestep] for timestep in [before, *part]])
+                seconds[0] = seconds[0] if number else np.inf
+                motion = MotionPrior.of(self.poses[before], seconds)
+            self.fit(f"last-{number:05d}", part, marks, part, part_progress, LastPass(texture, motion))
         for timestep in self.outliers() & former.keys():
             self.poses[timestep], self.residuals[timestep] = former[timestep]
 
@@ -375,15 +386,6 @@ _PART = {
 }
 
 
-class LastPass(NamedTuple):
-    """Inputs of the final pass over consecutive timesteps."""
-
-    texture: FloatArray
-    """(P, 3) colours of the sampled vertices."""
-    seconds: float
-    """Between timesteps; 0 where it is not known."""
-
-
 def _fit_block(
     clip: CaptureClip,
     cameras: Sequence[str],
@@ -403,19 +405,20 @@ def _fit_block(
     masks = [clip.mask(key) for key in keys]
     outlines = [None if mask is None else outline_of(mask) for mask in masks]
     stack = FrameStack([clip.image(key) for key in keys])
-    head = clip.head if offset is None else with_offset(clip.head, offset)
+    head = clip.head
+    if shape is not None and offset is not None:
+        head = with_shape(with_offset(head, offset), shape)
     fitter = Fitter(head, views, landmarks, sampled_vertices(clip.head), outlines)
-    if last is not None and shape is not None and poses is not None:
-        state = HeadState(shape, poses)
-        motion = motion_spread(part, last.seconds, state.poses.shape[1]) if last.seconds else None
-        assert offset is not None
-        fitted = fitter.fit_colours(state, stack, last=(last.texture, motion), progress=progress)
+    state = fitter.start() if poses is None else HeadState(np.zeros(0), poses)
+    if last is None:
+        state = fitter.fit_landmarks(state)
+    if shape is None or offset is None:
+        fitted, offset = fitter.fit_subject(state, stack, progress)
+        shape = fitted.state.shape
     else:
-        state = fitter.start(shape) if shape is None or poses is None else HeadState(shape, poses)
-        state = fitter.fit_landmarks(state, keep_shape=shape is not None)
-        fitted, offset = fitter.fit(state, stack, offset, progress)
+        fitted = fitter.fit_colours(state, stack, last=last, progress=progress)
     return {
-        "shape": fitted.state.shape,
+        "shape": shape,
         "offset": offset,
         "texture": fitted.texture,
         "poses": fitted.state.poses,

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 EMBEDDED = "2023"
 """Default head model of a video."""
-_FOCAL = {"pixels": Member("f", ()), "residuals": Member("f", ("N",)), "tried": Member("f", ("N",))}
+_FOCAL = {"pixels": Member("f", ()), "residuals": Member("f", ("N",))}
 
 
 class OpenedVideo(NamedTuple):
@@ -41,8 +41,8 @@ class OpenedVideo(NamedTuple):
     """Name of the file of the landmark network."""
     numbers: list[int]
     """Numbers in the file of the frames of the clip."""
-    seconds: float
-    """Between timesteps of the clip."""
+    times: dict[int, float]
+    """Seconds at which the timesteps of the clip are."""
     data: dict[str, Any]
     lines: list[str]
 
@@ -88,16 +88,17 @@ def video_to_track(settings: TrackSettings, folder: Path, progress: Progress) ->
                 for name, value in estimate_focal(clip.head, camera, detected, side)._asdict().items()
             },
         )
-        focal = FocalLength(float(stored["pixels"]), stored["residuals"], stored["tried"])
+        focal = FocalLength(float(stored["pixels"]), stored["residuals"])
         clip = video.with_focal(focal.pixels / video.view.scale)
         landmarks = NetworkLandmarks(video.found, embedding, clip, [*clip.cameras])
+    numbers = video.faces.numbers[video.faces.found].tolist()
     return OpenedVideo(
         clip,
         video.view,
         landmarks,
         network.name,
-        video.faces.numbers[video.faces.found].tolist(),
-        1 / min(settings.rate, video.info.rate),
+        numbers,
+        {timestep: number / video.info.rate for timestep, number in enumerate(numbers)},
         _data(video, settings.focal, focal),
         _lines(video, settings.focal, focal),
     )
@@ -120,7 +121,6 @@ def _data(video: VideoClip, given: float | None, focal: FocalLength | None) -> d
             "without_face": [*video.without_face],
             "found_again": [one._asdict() for one in video.faces.again],
             "other_faces": video.faces.numbers[video.faces.others > 0].tolist(),
-            **({"unsure": [*video.unsure]} if video.unsure else {}),
             "focal": dict(zip(("pixels", "source"), _focal(video, given, focal))),
         }
     }
@@ -152,11 +152,6 @@ def _lines(video: VideoClip, given: float | None, focal: FocalLength | None) -> 
         lines.append(
             f"  others     {listed(faces.numbers[faces.others > 0].tolist())} with a second face. The face that is largest in "
             f"frame {faces.numbers[faces.found][0]} is followed."
-        )
-    if video.unsure:
-        half, most = np.quantile(video.unsure, [0.5, 1.0])
-        lines.append(
-            f"  masks      {half:.0%} of the person's pixels are unsure (median of the frames), {most:.0%} in the worst frame"
         )
     return lines
 

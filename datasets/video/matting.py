@@ -30,6 +30,8 @@ RADIUS, SMOOTHNESS = 2, 6.5
 """Of the guided filter: units and squared levels of 255."""
 CLEAN = 0.05
 """Coverage up to which a pixel is empty, and 1 minus that from which it is full."""
+REACH = 4
+"""Units within which coverage is partial beside the person, and on the person beside the room."""
 
 
 class _Outline(NamedTuple):
@@ -45,8 +47,13 @@ class _Outline(NamedTuple):
 
     @classmethod
     def of(cls, image: ByteArray, mask: ByteArray) -> _Outline:
+        """Colours decide about the surroundings of the room alone: inside the face, a highlight may look like the room."""
         kernel = _disk(_unit(mask))
         inside, outside = cv2.erode(mask, kernel) > SURE, cv2.dilate(mask, kernel) < 255 - SURE
+        _, parts = cv2.connectedComponents((mask <= 127).astype(np.uint8))
+        room = np.bincount(parts[outside], minlength=parts.max() + 1) > 0  # others are holes
+        beside = cv2.dilate(room[parts].astype(np.uint8), _disk(REACH * _unit(mask))) > 0
+        inside |= ~beside
         near = ~(inside | outside)
         return cls(inside, near, _colours(image, inside)[near], _colours(image, outside)[near])
 
@@ -89,7 +96,7 @@ def _disk(radius: int) -> ByteArray:
 
 
 def _connected(mask: ByteArray, face: FloatArray) -> ByteArray:
-    """The part of a mask that is connected with most landmarks, and partial coverage within 4 units of it."""
+    """The part of a mask that is connected with most landmarks, and partial coverage within `REACH` of it."""
     _, labels = cv2.connectedComponents((mask > 127).astype(np.uint8))
     columns, rows = (np.rint(face).astype(int).clip(0, np.array(mask.shape)[::-1] - 1)).T
     counts = np.bincount(labels[rows, columns])
@@ -97,7 +104,7 @@ def _connected(mask: ByteArray, face: FloatArray) -> ByteArray:
     if not counts.any():
         return mask
     person = (labels == counts.argmax()).astype(np.uint8)
-    return np.where(cv2.dilate(person, _disk(4 * _unit(mask))) > 0, mask, 0).astype(np.uint8)
+    return np.where(cv2.dilate(person, _disk(REACH * _unit(mask))) > 0, mask, 0).astype(np.uint8)
 
 
 def _colours(image: ByteArray, chosen: npt.NDArray[np.bool_]) -> FloatArray:
@@ -106,9 +113,7 @@ def _colours(image: ByteArray, chosen: npt.NDArray[np.bool_]) -> FloatArray:
     scale = CELLS / max(height, width)
     cells = max(1, round(width * scale)), max(1, round(height * scale))
     weights = 255 * chosen.astype(np.uint8)
-    layers = cv2.bitwise_and(image, image, mask=weights), weights
-    sums = np.dstack([cv2.resize(layer, cells, interpolation=cv2.INTER_AREA) for layer in layers]).astype(
-        np.float32
-    )
+    layers = np.dstack([cv2.bitwise_and(image, image, mask=weights), weights]).astype(np.float32)
+    sums = cv2.resize(layers, cells, interpolation=cv2.INTER_AREA)
     sums = cv2.blur(sums, (3, 3)) + 1e-3 * cv2.blur(sums, (FARTHER, FARTHER)) + 1e-6 * sums.mean(axis=(0, 1))
     return cv2.resize(sums[..., :3] / np.maximum(sums[..., 3:], 1e-6), (width, height))

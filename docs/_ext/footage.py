@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy import ndimage
 
 from headbench.bench.contracts import ByteArray, Camera
 from headbench.datasets.clip import CaptureClip
@@ -19,13 +20,12 @@ from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.mesh_pictures import draw_mesh
 from headbench.datasets.synthetic.plan import FRONTAL
-from headbench.datasets.video.clip import LEAST_EMPTY, learn_background
 
 PICTURES = Path(__file__).parents[1] / "pictures"
 LONGEST = 440
 """Longest side of a picture, pixels."""
-NOISE = 2.0
-"""Of the camera, levels of 255."""
+NOISE, CONTRAST = 2.0, 12.0
+"""Of the camera, and smallest difference from the wall that shows, levels of 255."""
 
 
 def mesh_over(clip: CaptureClip, camera: Camera, image: ByteArray) -> ByteArray:
@@ -44,7 +44,7 @@ def nearer(camera: Camera, head: np.ndarray, ratio: float) -> Camera:
 
 
 def before_wall(clip: CaptureClip, camera: Camera, mesh: np.ndarray) -> ByteArray:
-    """The first frame with the mask that ``--masks background`` makes of it where the wall has the colour of the hair."""
+    """The first frame with a mask by the difference from a wall that has the colour of the hair."""
     key = clip.frame_at[min(clip.poses), camera.id]
     image, cover = clip.image(key), clip.mask(key)[..., None] / 255
     seen = mesh @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
@@ -53,17 +53,13 @@ def before_wall(clip: CaptureClip, camera: Camera, mesh: np.ndarray) -> ByteArra
     rows = np.arange(len(image))[:, None, None]
     hair = (cover > 0.9) & (rows < face[:, 1].min())
     wall = np.median(image[hair[..., 0]], axis=0)
-    rng = np.random.default_rng(0)
-
-    def filmed(person: np.ndarray | float) -> ByteArray:
-        shown = wall + cover * (person - wall)
-        return (shown + rng.normal(0, NOISE, image.shape)).clip(0, 255).astype(np.uint8)
-
-    background = learn_background(Path("wall"), [filmed(wall) for _ in range(LEAST_EMPTY)])
     # The person's own colours without the white that the capture has at soft edges.
     own = np.where(cover > 0.05, 255 + (image - 255.0) / np.maximum(cover, 0.05), 255)
-    mask = background.mask(filmed(own), face).mask
-    return np.where(mask[..., None] > 127, image, 255).astype(np.uint8)
+    difference = cover * (own - wall) + np.random.default_rng(0).normal(0, NOISE, image.shape)
+    shown = ndimage.binary_opening(np.abs(difference).max(axis=2) > CONTRAST, np.ones((3, 3)))
+    parts, _ = ndimage.label(shown)
+    person = parts == np.bincount(parts[parts > 0]).argmax()
+    return np.where(ndimage.binary_fill_holes(person)[..., None], image, 255).astype(np.uint8)
 
 
 def main(capture: Path) -> None:

@@ -223,12 +223,14 @@ class NearestLandmarks:
     def __init__(self, landmarks: Tensor, near_squared: float, far_squared: float):
         self._landmarks = landmarks
         self._near, self._far = near_squared**0.5, far_squared**0.5
-        self._places: Tensor | None = None
+        self._places = landmarks[:0]
+        self._room = landmarks.new_zeros(0)
+        self._nearest = torch.zeros_like(self._room, dtype=torch.int64)
 
     @torch.no_grad()
     def __call__(self, points: Tensor) -> Tensor:
         """(N,) indices for (N, 3) points, the same ones in all calls."""
-        if self._places is None:
+        if not len(self._places):
             self._places, self._room = points.clone(), points.new_zeros(len(points))
             self._nearest = torch.zeros_like(self._room, dtype=torch.int64)
         moved = torch.linalg.vector_norm(points - self._places, dim=1)

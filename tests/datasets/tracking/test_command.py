@@ -79,6 +79,8 @@ def test_what_does_not_fit_is_refused(patterned_capture, tmp_path):
         (TrackSettings(capture, out, embedding=capture), "landmarks"),
         (TrackSettings(capture, out, landmarks=missing, embedding=capture), "no such file"),
         (TrackSettings(str(headless), out), "head model"),
+        (TrackSettings(capture, out, focal=900.0), "--focal: expected a video file"),
+        (TrackSettings(capture, out, held_out_frames=3), "--held-out-frames: expected a video file"),
         (TrackSettings(capture, str(patterned_capture.writer.root)), "outside the capture"),
     ):
         with pytest.raises(InputError, match=found):

@@ -8,8 +8,8 @@ from headbench.bench.contracts import Camera
 from headbench.datasets.head.arrays import with_derived_regions
 from headbench.datasets.head.procedural.model import procedural_head
 from headbench.datasets.mesh_pictures import rasterize_mesh
-from headbench.datasets.tracking.equations import HeadState, NormalEquations
-from headbench.datasets.tracking.fit import LEVELS, Fitter, sampled_vertices
+from headbench.datasets.tracking.equations import HeadState, MotionPrior, NormalEquations
+from headbench.datasets.tracking.fit import LEVELS, Fitter, LastPass, sampled_vertices, with_shape
 from headbench.datasets.tracking.landmarks import ImageLandmarks
 from headbench.datasets.tracking.outline import outline_of
 from headbench.datasets.tracking.rig import FrameStack, PointRig, PoseColumns, Views
@@ -19,7 +19,9 @@ SIZE = 192
 
 @pytest.fixture(scope="module")
 def head():
-    return with_derived_regions(procedural_head("2023"))
+    """A head whose shape is kept."""
+    whole = with_derived_regions(procedural_head("2023"))
+    return with_shape(whole, np.zeros(whole.shape_basis.shape[2]))
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +58,7 @@ def test_an_outline_moves_the_head_where_colours_say_nothing(head, camera, maske
     state = resting(head)
     aside = PoseColumns.of(head).translation.start
     state.poses[0, aside] = 0.005
-    found = fitter.fit_colours(state, FrameStack([GREY]), levels=LEVELS[:1], keep_shape=True).state
+    found = fitter.fit_colours(state, FrameStack([GREY]), levels=LEVELS[:1]).state
     rig = PointRig.at_vertices(head, np.asarray(head.regions["nose"]))
     moved = rig.points(found.shape, found.poses[0]) - mesh[head.regions["nose"]]
     assert abs(1e3 * moved[:, 0].mean()) == pytest.approx(left_mm, abs=1.0)
@@ -73,7 +75,7 @@ def test_outlines_of_several_cameras_open_the_mouth(head, camera):
     ]
     landmarks = NOTHING._replace(pixels=np.repeat(NOTHING.pixels, 2, axis=1))
     fitter = Fitter(head, Views(views), landmarks, sampled_vertices(head), [outline_of(one) for one in masks])
-    found = fitter.fit_colours(state, FrameStack([GREY] * 2), levels=LEVELS[:2], keep_shape=True).state
+    found = fitter.fit_colours(state, FrameStack([GREY] * 2), levels=LEVELS[:2]).state
     lips = np.asarray(head.regions["lips"])
     gaps = [rig.points(one.shape, one.poses[0])[lips] - mesh[lips] for one in (state, found)]
     before, after = (np.sqrt((gap**2).sum(axis=1).mean()) for gap in gaps)
@@ -91,23 +93,50 @@ def test_the_residual_is_not_that_of_one_wrong_camera(head, camera):
     assert fitter.add_landmarks(NormalEquations(state), fitter.landmark_rig(), state, 1.0)[0] < 0.1
 
 
-@pytest.mark.parametrize("linked", [True, False])
-def test_the_last_pass_keeps_shape_and_half_turns(head, camera, linked):
+def last_pass(head, camera, poses, pixels, motion):
+    """Poses (T, D) after the final pass on grey images with landmarks (T, L, 2) at the nose."""
     vertices = sampled_vertices(head)
-    landmarks = NOTHING._replace(pixels=np.repeat(NOTHING.pixels, 2, axis=0))
+    members = np.asarray(head.regions["nose"])
+    corners, weights = np.repeat(members[:, None], 3, axis=1), np.tile([1.0, 0, 0], (len(members), 1))
+    landmarks = ImageLandmarks(corners, weights, pixels[:, None], NOTHING.pairs)
+    fitter = Fitter(head, Views([camera]), landmarks, vertices)
+    last = LastPass(np.zeros((len(vertices), 3)), motion)
+    stack = FrameStack([GREY] * len(poses))
+    return fitter.fit_colours(HeadState(np.zeros(0), poses), stack, last=last).state.poses
+
+
+def test_the_last_pass_keeps_half_turns(head, camera):
     filming = Camera("0", SIZE, SIZE, camera.K, np.eye(4))  # as of a video: the head is turned towards it
-    fitter = Fitter(head, Views([filming]), landmarks, vertices)
     state = resting(head)
     state.poses[0, PoseColumns.of(head).translation] = 0, 0.3, 1
-    poses = np.repeat(state.poses, 2, axis=0)
-    poses[:, 0] = np.pi - 0.01, -np.pi + 0.01  # nearly the same rotation
-    given = HeadState(state.shape + 0.5, poses)
-    motion = np.full((1, poses.shape[1]), 0.05) if linked else None
-    colours = np.zeros((len(vertices), 3))
-    found = fitter.fit_colours(given, FrameStack([GREY] * 2), last=(colours, motion)).state
-    np.testing.assert_array_equal(found.shape, given.shape)
+    poses = np.repeat(state.poses, 3, axis=0)
+    poses[:, 0] = np.pi - 0.01, -np.pi + 0.01, np.pi - 0.01  # nearly the same rotation
+    pixels = np.full((2, len(head.regions["nose"]), 2), np.nan)
+    motion = MotionPrior(poses[0], np.full((2, poses.shape[1]), 0.05))
+    poses = poses[1:]
+    found = HeadState(np.zeros(0), last_pass(head, filming, poses, pixels, motion))
     turned = Rotation.from_rotvec(found.poses[:, :3]) * Rotation.from_rotvec(poses[:, :3]).inv()
     assert turned.magnitude().max() < 0.05
+
+
+def test_the_prior_of_motion_removes_jitter(head, camera):
+    frames, nose = 12, np.asarray(head.regions["nose"])
+    poses = np.repeat(resting(head).poses, frames, axis=0)
+    still = Views([camera]).project(np.asarray(head.template, np.float64)[nose]).pixels[0]
+    pixels = still + 4.0 * np.random.default_rng(0).standard_normal((frames, 1, 2))
+    aside = PoseColumns.of(head).translation.start
+    seconds = np.array([np.inf] + [1 / 30] * (frames - 1))
+    found, loose, late = (
+        last_pass(head, camera, poses, pixels, motion)[:, aside]
+        for motion in (
+            MotionPrior.of(poses[0], seconds),
+            None,
+            MotionPrior.of(poses[0], np.where(np.arange(frames) == 6, 5.0, seconds)),  # a face lost for 5 s
+        )
+    )
+    jitter, without = (np.abs(np.diff(one)).mean() for one in (found, loose))
+    assert jitter < 0.5 * without
+    assert abs(late[6] - late[5]) > 1.5 * abs(found[6] - found[5])
 
 
 def test_pairs_of_landmarks_open_the_mouth(head, camera):
@@ -126,7 +155,7 @@ def test_pairs_of_landmarks_open_the_mouth(head, camera):
     def gap(pairs):
         marks = ImageLandmarks(corners, weights, pixels, np.array(pairs, int).reshape(-1, 2))
         fitter = Fitter(head, views, marks, np.zeros(0, int))
-        found = fitter.fit_landmarks(resting(head), keep_shape=True, weight=1e-4)
+        found = fitter.fit_landmarks(resting(head), weight=1e-4)
         assert found.poses.shape == (1, columns.size)
         places = views.project(rig.points(found.shape, found.poses[0])).pixels[0]
         return np.linalg.norm((places[0] - places[1]) - (pixels[0, 0, 0] - pixels[0, 0, 1]))

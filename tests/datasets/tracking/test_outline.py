@@ -45,6 +45,20 @@ def test_the_outline_of_a_disk_is_a_circle():
     assert gaps(outline, middle + 27.0 * turned, -turned).aligned.tolist() == [0, 0]
 
 
+def test_both_sides_of_a_mask_cut_by_two_borders_count():
+    mask = np.zeros((100, 120), np.uint8)
+    for row in range(100):
+        mask[row, 40 : 80 + row // 10] = 255  # the right side is longer
+    mask[40:50, 55:65] = 0  # a hole
+    mask[:, :5] = 255  # another part
+    outline = outline_of(mask)
+    left = outline.normals[:, 0] < 0
+    np.testing.assert_allclose(outline.pixels[left, 0], 40, atol=0.01)
+    assert outline.pixels[~left, 0].min() > 79
+    for side in (left, ~left):
+        assert np.ptp(outline.pixels[side, 1]) > 90
+
+
 def test_an_empty_mask_has_no_outline():
     assert outline_of(np.zeros((20, 20), np.uint8)) is None
     assert outline_of(np.full((20, 20), 255, np.uint8)) is None

@@ -14,6 +14,7 @@ from headbench.bench.errors import InputError
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.tracking import track as track_module
+from headbench.datasets.tracking.equations import SPEED
 from headbench.datasets.tracking.fit import Fitter, sampled_vertices
 from headbench.datasets.tracking.landmarks import known_rig_landmarks, spread_vertices
 from headbench.datasets.tracking.rig import FrameStack, PoseColumns, Views, outliers
@@ -136,6 +137,27 @@ def test_blocks_share_the_shape(clip, frontal, monkeypatch):
     tracked, report = track(clip, frontal[:1], noted)
     assert [len(part) for part in asked] == [3, 2]
     assert sorted(asked[0] + asked[1]) == sorted(tracked.poses) == [one.timestep for one in report.residuals]
+
+
+def test_parts_of_the_last_pass_are_linked_by_time(clip, frontal, monkeypatch):
+    timesteps, fit_block, passes = sorted(clip.poses), track_module._fit_block, []
+    camera = clip.cameras[frontal[0]]
+    monkeypatch.setattr(track_module, "MOST_PIXELS", 12 * camera.width * camera.height)  # three timesteps
+
+    def noted(*given):
+        fitted, last = fit_block(*given), given[8]
+        if last is not None:
+            passes.append((given[3], last.motion, fitted["poses"]))
+        return fitted
+
+    monkeypatch.setattr(track_module, "_fit_block", noted)
+    times = dict(zip(timesteps, [0.0, 0.04, 5.0, 5.04, 5.12]))
+    track(clip, frontal[:1], source(clip, frontal[:1]), times=times)
+    assert [part for part, _, _ in passes] == [timesteps[:3], timesteps[3:]]
+    (_, first, poses), (_, second, _) = passes
+    np.testing.assert_array_equal(second.before, poses[-1])
+    speeds = [one.deviations[:, 0] / SPEED[0][0] for one in (first, second)]
+    np.testing.assert_allclose(np.concatenate(speeds), [np.inf, 0.04, 4.96, 0.04, 0.08])
 
 
 def test_what_cannot_be_tracked_is_left_out(clip, frontal):

@@ -86,13 +86,39 @@ def test_frames_of_one_part_are_not_changed():
         assert np.array_equal(without_room(image, mask), image)
 
 
-def test_two_flat_colours_determine_the_coverage():
+def disk():
+    """A frame of two flat colours with a disk, its exact mask, and the distance of pixels from its middle; its radius is 30."""
     side = 96
     place = np.stack(np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5), axis=2)
     distance = np.linalg.norm(place - [50.2, 44.9], axis=2)
     coverage = np.clip(30.5 - distance, 0, 1)[..., None]
     frame = np.rint(coverage * [200, 40, 30] + (1 - coverage) * [20, 60, 210]).astype(np.uint8)
-    exact = np.rint(255 * coverage[..., 0]).astype(np.uint8)
+    return frame, np.rint(255 * coverage[..., 0]).astype(np.uint8), distance
+
+
+@pytest.mark.parametrize(("level", "radius"), [(230, 6), (100, 3)])
+def test_a_highlight_of_the_colour_of_the_room_is_kept(level, radius):
+    frame, mask, distance = disk()
+    spot = distance < radius
+    frame[spot] = 20, 60, 210
+    mask[spot] = level
+    refined = refined_mask(frame, mask, np.array([[50.0, 30.0]]))
+    assert refined[spot].min() > 250
+    assert np.array_equal(without_room(frame, refined)[spot], frame[spot])
+
+
+def test_a_hole_that_the_mask_is_sure_of_is_kept():
+    frame, mask, distance = disk()
+    hole = distance < 10
+    frame[hole] = 20, 60, 210
+    mask[hole] = 0
+    refined = refined_mask(frame, cv2.GaussianBlur(mask, (0, 0), 1.0), np.array([[50.0, 30.0]]))
+    assert refined[distance < 8].max() < 5
+    assert refined[(distance > 12) & (distance < 26)].min() > 250
+
+
+def test_two_flat_colours_determine_the_coverage():
+    frame, exact, distance = disk()
     coarse = cv2.GaussianBlur(exact, (0, 0), 2.0)
     before, after = (
         np.abs(mask.astype(float) - exact)[np.abs(distance - 30) < 3].mean()
