@@ -54,9 +54,9 @@ def test_a_file_with_a_wrong_key_or_value_is_refused(tmp_path, change, message):
 DIGESTS = {
     "ava-256": "190547d8fa32",
     "few-images": "090d1c25218b",
-    "hdtf": "3cc60d8da989",
+    "hdtf": "e10eac07fb66",
     "last-10-percent": "b85a585d8289",
-    "vfhq-cross": "1175b5179e46",
+    "vfhq-cross": "333f7ca55c77",
     "vfhq-self": "661638fea8af",
 }
 
