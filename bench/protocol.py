@@ -32,30 +32,46 @@ class TaskFrames:
     """Prefixes of sequence names, such as "FREE"; () selects all held-out sequences."""
     last: int | None = None
     """Only this many timesteps at the end of each sequence."""
+    share: float | None = None
+    """Share of all frames that a capture holds out for the task, to within one frame."""
 
     def __post_init__(self) -> None:
-        """Refuse a number of timesteps below 1."""
+        """Refuse a number of timesteps below 1, and a share that is none or all."""
         if self.last is not None and self.last < 1:
             raise ValueError(f"last: at least 1, or null for all; found {self.last}")
+        if self.share is not None and not 0 < self.share < 1:
+            raise ValueError(f"share: between 0 and 1, or null; found {self.share}")
+
+    def check_share(self, held_out: int, trained: int, place: str, name: str) -> None:
+        """Raise `InputError` if a capture holds out another share of its frames than protocol ``name``."""
+        if self.share is None or abs(held_out - (wanted := self.share * (held_out + trained))) < 1:
+            return
+        expected = f"{round(wanted)} of {held_out + trained} frames held out, by protocol {name}"
+        remedy = f"For a video: --set reader_settings.held_out_frames={round(wanted)}"
+        raise InputError(place, "splits", expected, str(held_out), remedy)
 
 
 @dataclass(frozen=True)
 class NamedProtocol:
     """The evaluation protocol of a paper or benchmark.
 
-    ``tasks``, ``region``, ``profile``, ``average`` and ``pooled`` select and combine values; the other fields describe how the
-    published values were obtained, and tables list how a run differs.
+    ``tasks``, ``region``, ``profile``, ``metrics``, ``average`` and ``pooled`` select and combine values; the other fields describe
+    how the published values were obtained, and tables list how a run differs.
     """
 
     title: str
     source: str
     """``title``, ``source``: Paper or benchmark, and where its protocol was read."""
     tasks: Mapping[str, TaskFrames]
-    """Scored frames by task: novel_view, self_reenactment."""
+    """Scored frames by task: novel_view, self_reenactment; or cross_reenactment, whose frames have no ground truth."""
     region: str = "full"
     """Pixels for PSNR and SSIM: "full", "foreground", "face" or another region of the captures."""
     profile: str = "canonical"
     """Metric profile, see ``headbench list profiles``."""
+    metrics: tuple[str, ...] = ()
+    """Metrics of images; () for PSNR, SSIM and LPIPS of the profile. In cross_reenactment they compare with the driving frame."""
+    source_metrics: tuple[str, ...] = ()
+    """Metrics that compare with the source picture, in cross_reenactment."""
     average: Literal["sequences", "frames"] = "frames"
     """Whether every sequence of a subject has the same weight, or every frame."""
     pooled: int | None = None
@@ -73,16 +89,47 @@ class NamedProtocol:
     """``tracker``, ``head_model``: Tracker and head model of the driving signal."""
     test_refit: bool | None = None
     """Whether scored frames are fitted to their own pictures first, as under the condition test-refit; None if unknown."""
+    pictures: tuple[int, ...] = ()
+    """Numbers of input pictures of methods that learn from other people; () for methods that train on a capture."""
+    pairs: str = ""
+    crop: str = ""
+    background: str = ""
+    """``pairs``, ``crop``, ``background``: Source and driver, crop of both images, and colour behind the person."""
+    grade: Literal["", "A", "B", "C"] = ""
+    """How it was read, as for published tables; "" for protocols that predate the grades."""
+    unknown: tuple[str, ...] = ()
+    """What the sources do not state, or state differently."""
 
     def __post_init__(self) -> None:
-        """Refuse unknown tasks, none, and batches of less than one frame."""
+        """Refuse unknown tasks, none, metrics that need a missing ground truth, and batches of less than one frame."""
         for task in self.tasks:
-            if task not in ("novel_view", "self_reenactment"):
-                raise ValueError(f"tasks: novel_view or self_reenactment; found {task}")
+            if task not in TASKS:
+                raise ValueError(f"tasks: {', '.join(TASKS[:-1])} or {TASKS[-1]}; found {task}")
         if not self.tasks:
             raise ValueError("tasks: at least one; found none")
+        self.check_metrics(self.compared)
         if self.pooled is not None and self.pooled < 1:
             raise ValueError(f"pooled: at least 1, or null; found {self.pooled}")
+
+    @property
+    def compared(self) -> tuple[str, ...]:
+        """Names of the metrics that compare with the true frame or, in cross_reenactment, the driving frame."""
+        suffix = "" if self.profile == "canonical" else f"@{self.profile}"
+        return self.metrics or tuple(f"{name}{suffix}" for name in ("psnr", "ssim", "lpips"))
+
+    def check_metrics(self, names: Iterable[str]) -> None:
+        """Raise `ValueError` for metrics of pixels, if frames have no ground truth."""
+        for name in names:
+            if "cross_reenactment" in self.tasks and name.partition("-")[0] not in WITHOUT_TRUTH:
+                expected = " or ".join(each.upper() for each in WITHOUT_TRUTH)
+                raise ValueError(
+                    f"metrics: {expected}, as frames of another person have no ground truth; found {name}"
+                )
+
+
+TASKS = ("novel_view", "self_reenactment", "cross_reenactment")
+WITHOUT_TRUTH = ("csim", "aed", "apd", "akd")
+"""Metrics of frames without ground truth, by the first part of their names."""
 
 
 @cache
@@ -105,6 +152,7 @@ def needed(names: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
     wanted: dict[str, list[str]] = {"tasks": [], "metric_profiles": ["canonical"], "regions": []}
     for name in names:
         protocol = protocol_named(name)
+        check_trained(name, protocol, "command line")
         wanted["tasks"] += protocol.tasks
         wanted["metric_profiles"].append(protocol.profile)
         wanted["regions"] += [] if protocol.region == "full" else ["face", protocol.region]
@@ -117,6 +165,16 @@ def needed(names: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
             expected = f"{', '.join(sorted(lacking))}, by protocol {' or '.join(names)}"
             raise InputError("settings", key, expected, ", ".join(given))
     return values_needed
+
+
+def check_trained(name: str, protocol: NamedProtocol, place: str | Path) -> None:
+    """Raise `InputError` for a protocol of methods that do not train on a capture, which no run follows."""
+    if protocol.pictures:
+        expected = "a protocol of methods that train on a capture"
+        noun = "picture" if protocol.pictures == (1,) else "pictures"
+        found = f"{name}, whose methods are given {' or '.join(map(str, protocol.pictures))} {noun}"
+        remedy = f"Score their images with `headbench evaluate RENDERS --truth TRUTH --protocol {name}`."
+        raise InputError(place, "--protocol", expected, found, remedy)
 
 
 def check_capture(names: Sequence[str], clip: Clip) -> None:
@@ -135,6 +193,7 @@ def check_capture(names: Sequence[str], clip: Clip) -> None:
         if wanted.sequences and not any(each.startswith(wanted.sequences) for each in sequences):
             expected = f"{' or '.join(wanted.sequences)} in {task}, by protocol {name}"
             raise InputError(place, "sequences", expected, ", ".join(sequences))
+        wanted.check_share(len(keys), len(clip.splits["train"]), place, name)
 
 
 Item = TypeVar("Item")

@@ -19,10 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
-from ..bench.errors import InputError
-from ..bench.io.files import read_bytes, reading
 from ..bench.specs import MetricSpec, Need
-from .faces import AtLandmarks, DlibIdentity, FaceMetric, dlib_needs, named_file, network_need
+from .faces import AtLandmarks, DlibIdentity, FaceMetric, OnnxNetwork, dlib_needs, named_file, network_need
 
 SIDE = 112
 """Side of the network's input, pixels."""
@@ -37,29 +35,11 @@ class ArcFace:
     """The network in an ONNX file."""
 
     def __init__(self, path: Path):
-        expected = f"a network of ONNX that maps a picture of {SIDE}x{SIDE} pixels to {LENGTH} numbers"
-        content = read_bytes(path, expected)
-        with reading(path, expected):
-            import cv2
-
-            self._network = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
-            found = self._run(np.zeros((SIDE, SIDE, 3), np.uint8))
-        if found.shape != (1, LENGTH):
-            raise InputError(path, "", expected, f"an output of shape {found.shape}")
-        if not np.isfinite(found).all():
-            raise InputError(path, "", expected, "numbers that are not finite")
+        self._network = OnnxNetwork(path, SIDE, LENGTH, 127.5, 127.5)
 
     def __call__(self, image: ByteArray, landmarks: FloatArray) -> FloatArray:
         """(512,) embedding of the face in an (H, W, 3) 8-bit RGB image with (68, 2) landmarks of 300-W, pixels."""
-        import cv2
-
-        turn = alignment(five_points(landmarks), PLACES)
-        return self._run(np.asarray(cv2.warpAffine(image, turn, (SIDE, SIDE)), np.uint8))[0]
-
-    def _run(self, crop: ByteArray) -> FloatArray:
-        pixels = (crop.astype(np.float32) - 127.5) / 127.5
-        self._network.setInput(np.ascontiguousarray(pixels.transpose(2, 0, 1)[None]))
-        return np.array(self._network.forward(), float)
+        return self._network(image, alignment(five_points(landmarks), PLACES), SIDE)
 
 
 def five_points(landmarks: FloatArray) -> FloatArray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..bench.contracts import ByteArray, FloatArray
 from ..bench.errors import HeadbenchError, InputError, LeftOutError, UnavailableError, install_extra
+from ..bench.io.files import read_bytes, reading
 from ..bench.specs import Need
 from .psnr import check_pair
 
@@ -124,6 +125,36 @@ class AtLandmarks:
         """Output for the face of highest confidence."""
         landmarks = self._landmarks.find(image)
         return None if landmarks is None else self._network(image, landmarks)
+
+
+class OnnxNetwork:
+    """A network of an ONNX file that maps a square picture to numbers."""
+
+    def __init__(self, path: Path, side: int, length: int, shift: float = 0.0, scale: float = 1.0):
+        """Read the file; pixels p are given to the network as ``(p - shift) / scale``."""
+        self._shift, self._scale = shift, scale
+        expected = f"a network of ONNX that maps a picture of {side}x{side} pixels to {length} numbers"
+        content = read_bytes(path, expected)
+        with reading(path, expected):
+            import cv2
+
+            self._network = cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8))
+            found = self._run(np.zeros((side, side, 3), np.uint8))
+        if found.shape != (1, length):
+            raise InputError(path, "", expected, f"an output of shape {found.shape}")
+        if not np.isfinite(found).all():
+            raise InputError(path, "", expected, "numbers that are not finite")
+
+    def __call__(self, image: ByteArray, turn: FloatArray, side: int) -> FloatArray:
+        """Numbers of the crop of an (H, W, 3) 8-bit RGB image that its (2, 3) affine map to (side, side) pixels defines."""
+        import cv2
+
+        return self._run(np.asarray(cv2.warpAffine(image, turn, (side, side)), np.uint8))[0]
+
+    def _run(self, crop: ByteArray) -> FloatArray:
+        pixels = (crop.astype(np.float32) - self._shift) / self._scale
+        self._network.setInput(np.ascontiguousarray(pixels.transpose(2, 0, 1)[None]))
+        return np.array(self._network.forward(), float)
 
 
 def named_file(metric: str, variable: str, remedy: str) -> Path:

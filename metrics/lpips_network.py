@@ -53,8 +53,8 @@ from .psnr import check_pair
 EXPECTED = "a PyTorch file of weights"
 
 
-def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
-    """Read the tensors named in ``shapes`` as float32, on the CPU."""
+def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]], entry: str = "") -> dict[str, Tensor]:
+    """Read the tensors named in ``shapes`` as float32, on the CPU; ``entry`` names the dictionary in the file's dictionary."""
     with open_regular(path, EXPECTED) as stream, reading(path, EXPECTED):
         try:
             content = torch.load(stream, map_location="cpu", weights_only=True)
@@ -62,8 +62,10 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str,
             name = re.search(r"GLOBAL (\S+)", str(error))
             found = f"the name {name[1]}, which no weights need" if name else "another pickle"
             raise InputError(path, "", EXPECTED, found) from error
+    if entry and isinstance(content, dict):
+        content = content.get(entry)
     if not isinstance(content, dict):
-        raise InputError(path, "", "a dictionary of tensors", type(content).__name__)
+        raise InputError(path, entry, "a dictionary of tensors", type(content).__name__)
     return {name: _tensor(path, name, content.get(name), shape) for name, shape in shapes.items()}
 
 

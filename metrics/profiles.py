@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ..bench.specs import MetricSpec, ProfileSpec
-from .lpips import LPIPS, LPIPS_VGG
+from .lpips import LPIPS, LPIPS_SQUEEZE, LPIPS_VGG
 from .psnr import PSNR
 from .ssim import SSIM
 
@@ -80,6 +80,30 @@ GSPLAT = ProfileSpec(
         _of("gsplat", SSIM, "ssim:ssim_reflected", "Gaussian window 11 x 11, mirrored border, every pixel."),
         _of("gsplat", LPIPS, "lpips:lpips", "AlexNet, inputs in [-1, 1] (normalize=True)."),
         _of("gsplat", LPIPS_VGG, "lpips:lpips_vgg_unscaled", "VGG-16, inputs in [0, 1] (normalize=False)."),
+    ),
+)
+
+FLEXAVATAR = ProfileSpec(
+    name="flexavatar",
+    summary="what FlexAvatar's compute_metrics.py prints on VFHQ by torchmetrics: reflected-border SSIM, LPIPS SqueezeNet",
+    source="FlexAvatar 05bb9eb scripts/compute_metrics.py and the package visage; there PSNR of 16 frames together (protocol vfhq-self)",
+    metrics=(
+        _of("flexavatar", PSNR, *_PSNR),
+        _of(
+            "flexavatar",
+            SSIM,
+            "ssim:ssim_reflected",
+            "Gaussian window 11 x 11, mirrored border, every pixel.",
+        ),
+        replace(
+            _of(
+                "flexavatar",
+                LPIPS,
+                "lpips:lpips_squeeze",
+                "SqueezeNet 1.1, inputs in [-1, 1] (normalize=True).",
+            ),
+            needs=LPIPS_SQUEEZE.needs,
+        ),
     ),
 )
 

@@ -13,7 +13,7 @@ from ..bench.contracts import FrameKey, Progress
 from ..bench.engine.config import CANONICAL
 from ..bench.errors import InputError
 from ..bench.io.files import check_writable, write_text
-from ..bench.protocol import TASK_TITLES, NamedProtocol, TaskFrames, named_protocols
+from ..bench.protocol import TASK_TITLES, NamedProtocol, TaskFrames, check_trained, named_protocols
 from ..bench.registry import get
 from ..bench.rows import FULL
 from ..bench.specs import CommandResult, MetricSpec, command
@@ -32,6 +32,7 @@ def under(runs: RunSet, name: str, protocol: NamedProtocol) -> RunSet:
     Raises `InputError` if the runs or their captures lack a task, cameras, a sequence, a region or a metric profile.
     """
     source = runs.runs[0].folder.rows
+    check_trained(name, protocol, source)
     tasks = tuple(task for task in protocol.tasks if task in runs.tasks)
     if not tasks:
         expected = f"{' or '.join(protocol.tasks)}, by protocol {name}"
@@ -59,8 +60,10 @@ def under(runs: RunSet, name: str, protocol: NamedProtocol) -> RunSet:
 
 
 def _frames(runs: RunSet, task: str, wanted: TaskFrames, name: str) -> list[FrameKey]:
-    """The frames of a task. Raises `InputError` if there are none of its cameras or sequences."""
+    """The frames of a task. Raises `InputError` if there are none of its cameras or sequences, or a capture holds out others."""
     source, keys = runs.runs[0].folder.rows, sorted(runs.keys[task])
+    for clip in (clip for run in runs.runs for clip in run.manifest.clips):
+        wanted.check_share(clip.splits.get(task, 0), clip.splits["train"], f"clip {clip.subject}", name)
     if wanted.cameras != "all" and task != "novel_view":  # cameras of novel views are unseen
         unseen, reason = unseen_cameras([run.manifest for run in runs.runs], keys)
         hidden = wanted.cameras == "unseen"
@@ -162,7 +165,8 @@ def choices(runs: RunSet) -> dict[str, NamedProtocol]:
         some = {f"cameras: {cameras}": TaskFrames(cameras) for cameras in ("seen", "unseen")}
         some |= {f"sequences: {start}": TaskFrames(sequences=(start,)) for start in starts if len(starts) > 1}
         offered |= {name: replace(usual, tasks={"self_reenactment": frames}) for name, frames in some.items()}
-    return offered | {f"{NAMED}{name}": protocol for name, protocol in named_protocols().items()}
+    named = {f"{NAMED}{name}": protocol for name, protocol in named_protocols().items()}
+    return offered | {name: protocol for name, protocol in named.items() if not protocol.pictures}
 
 
 @command("protocols", group="compare")

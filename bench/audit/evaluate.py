@@ -113,7 +113,8 @@ class EvaluateSettings:
     """Metrics of frames to compute; default: those of `headbench run`. Not with --like. With --truth also NAME@PROFILE."""
 
     protocol: tuple[str, ...] = ()
-    """Published protocols, as for `headbench run`. Not with --like."""
+    """Published protocols, as for `headbench run`. Not with --like. With --truth one, whose metrics are computed unless --metrics
+    names others."""
 
     reader: str = ""
     """Which dataset reader opens the capture; default: the one that finds it. Not with --like."""
@@ -135,8 +136,8 @@ class EvaluateSettings:
         DependentOptions(("names", "any_background"), "avatar", False),
         DependentOptions(("masks", "resize"), "truth"),
         DependentOptions(
-            ("clip", "label", "avatar", "names", "any_background", "like", "tasks", "protocol", "reader")
-            + ("head", "frames_per_task"),
+            ("clip", "label", "avatar", "names", "any_background", "like", "tasks", "reader", "head")
+            + ("frames_per_task",),
             "truth",
             False,
         ),
@@ -252,7 +253,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
     if settings.truth is not None:
         masks = None if settings.masks is None else Path(settings.masks)
         out = Path(settings.out) if settings.out else None
-        how = settings.metrics, settings.resize, out, settings.device
+        how = settings.metrics, settings.protocol, settings.resize, out, settings.device
         return score_pairs(source, Path(settings.truth), masks, *how, progress)
     stored = open_avatar(source, settings.method) if settings.avatar else None
     label = settings.label or ("images" if stored is None else stored.record["method"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -25,6 +26,7 @@ from ..io.images import probe_image, read_pixels, read_png
 from ..io.videos import SUFFIXES, video_frames
 from ..machine import processor_count
 from ..progress import counted
+from ..protocol import NamedProtocol, protocol_named
 from ..registry import get
 from ..rows import FULL
 from ..specs import CommandResult, MetricSpec
@@ -272,6 +274,15 @@ class _Column:
         """Mean of a sequence; a metric of all frames together has none, unless it is the ``whole``."""
         return None if self.spec.kind == "set" and not whole else _mean(self.values(pairs))
 
+    def pooled_mean(self, pairs: Sequence[Pair], pooled: int | None) -> float | None:
+        """Mean of all pairs; of a metric in dB over batches of ``pooled`` pairs, each with the mean of its errors."""
+        values = self.values(pairs)
+        if pooled is None or self.spec.unit != "dB":
+            return _mean(values)
+        errors = [10 ** (-value / 10) for value in values]
+        batches = (errors[start : start + pooled] for start in range(0, len(errors), pooled))
+        return _mean([-10 * math.log10(fmean(batch)) for batch in batches])
+
     def shown(self, value: float | None) -> str:
         return "–" if value is None else f"{value:.{self.spec.digits}f}"
 
@@ -291,6 +302,7 @@ def score_pairs(
     truth: Path,
     masks: Path | None,
     metrics: Sequence[str],
+    protocols: Sequence[str],
     resize: Resize | None,
     out: Path | None,
     device: str,
@@ -299,7 +311,8 @@ def score_pairs(
     """Score two folders or two videos; write a CSV file with a row for each pair to ``out``."""
     if out is not None:
         check_writable(out, "--out")
-    specs = pair_metrics(metrics, masks=masks is not None)
+    protocol = _protocol(protocols, metrics)
+    specs = pair_metrics(metrics or (protocol.compared if protocol else ()), masks=masks is not None)
     pairs = find_pairs(renders, truth, masks, resize, progress)
     images = PairedImages(pairs, resize)
     regions = (MASK,) if masks is not None else ()
@@ -313,25 +326,67 @@ def score_pairs(
     notes = []
     if resize is not None:
         notes.append(f"Renders of another size are resized to that of the ground truth ({resize}).")
+    if protocol is not None:
+        height, width = images.image(keys[0]).shape[:2]
+        notes += _protocol_notes(protocols[0], protocol, f"{width}x{height}")
     if lossy := sum(pair.render.suffix.lower() != ".png" for pair in pairs):
         notes.append(f"The compression of {counted(lossy, 'render')} as JPEG or video is scored, too.")
     notes += [sentence for column in columns for sentence in column.missing(pairs)]
     if out is not None:
         write_text(out, _csv(pairs, columns))
         notes.append(str(out))
-    text, means = _means(pairs, columns, renders.name)
+    text, means = _means(pairs, columns, renders.name, protocol.pooled if protocol else None)
     about = f"{renders} against {truth}: {counted(len(pairs), 'pair')}."
-    data = {"pairs": len(pairs), **means, "resize": resize, "out": out}
+    data = {"pairs": len(pairs), **means, "resize": resize, "out": out, "protocol": list(protocols)}
     return CommandResult("\n\n".join([text, "\n".join([about, *notes])]), data)
 
 
-def _means(pairs: Sequence[Pair], columns: Sequence[_Column], title: str) -> tuple[str, dict[str, object]]:
-    """Means of every sequence, of sequences and of pairs, as a table and by name; ``title`` is for pairs without a folder."""
+def _protocol(names: Sequence[str], metrics: Sequence[str]) -> NamedProtocol | None:
+    """The named protocol, or None without a name. Raises `InputError` for several, and for metrics that it cannot have."""
+    if len(names) > 1:
+        raise InputError("command line", "--protocol", "one protocol with --truth", ", ".join(names))
+    protocol = protocol_named(names[0]) if names else None
+    if protocol is not None:
+        try:
+            protocol.check_metrics(metrics)
+        except ValueError as error:
+            expected, _, found = str(error).removeprefix("metrics: ").partition("; found ")
+            raise InputError("command line", "--metrics", expected, found) from error
+    return protocol
+
+
+def _protocol_notes(name: str, protocol: NamedProtocol, size: str) -> list[str]:
+    """Sentences on what a protocol asks besides its metrics."""
+    notes = [f"Protocol {name}: {protocol.title}."]
+    if protocol.size and size != protocol.size:
+        notes.append(f"Pixels: {size}; in the protocol: {protocol.size}.")
+    notes += [
+        f"{title}, which is not done here: {text}."
+        for title, text in (("Crop", protocol.crop), ("Background", protocol.background))
+        if text
+    ]
+    if protocol.pooled is not None:
+        notes.append(
+            f"PSNR of all pairs: mean over batches of {protocol.pooled} pairs, each by its mean squared error."
+        )
+    if protocol.source_metrics:
+        others = ",".join(protocol.source_metrics)
+        notes.append(f"Against the source pictures as --truth: --metrics {others}.")
+    return notes
+
+
+def _means(
+    pairs: Sequence[Pair], columns: Sequence[_Column], title: str, pooled: int | None
+) -> tuple[str, dict[str, object]]:
+    """Means of every sequence, of sequences and of pairs, as a table and by name.
+
+    ``title`` is for pairs without a folder. PSNR of all pairs is that of batches of ``pooled`` pairs.
+    """
     sequences = {name: list(of) for name, of in groupby(pairs, key=lambda pair: pair.key.sequence)}
     single = len(sequences) == 1
     means = {name: [column.mean(of, whole=single) for column in columns] for name, of in sequences.items()}
     over_sequences = [_mean([mean for mean in of if mean is not None]) for of in zip(*means.values())]
-    over_pairs = [_mean(column.values(pairs)) for column in columns]
+    over_pairs = [column.pooled_mean(pairs, pooled) for column in columns]
     rows = [(name or title, len(sequences[name]), values) for name, values in means.items()]
     if not single:
         rows = rows if len(rows) <= MOST_ROWS else []

@@ -7,7 +7,9 @@ seconds and pictures); OUT is the folder of the run or runs. A block of a page i
 """
 
 import os
+import re
 import sys
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -23,10 +25,11 @@ from headbench.bench.experiments.extremes import RECORD_FILE
 from headbench.bench.io.files import write_json, write_text
 from headbench.bench.progress import counted
 from headbench.bench.protocol import UNSEEN_CAMERAS
-from headbench.bench.registry import get
+from headbench.bench.registry import discover, get
 from headbench.bench.rows import FULL, Rows
 from headbench.reports.aggregate import coded_labels, summarise
 from headbench.reports.curve.curve import HELD_OUT, CurveData, leaders_text, read_curve
+from headbench.reports.papers import papers
 from headbench.reports.protocols import choice_effects
 from headbench.reports.runs import FrameSelection, RunData, RunSet
 from headbench.reports.suite.suite import (
@@ -111,6 +114,7 @@ class StoredResults:
             (f"{DOCS}/metrics.md", "mechanisms"): mechanisms(
                 {folder.name: self.read(folder) for folder in self.runs("mechanisms")}
             ),
+            (f"{DOCS}/methods/index.md", "matrix"): matrix(self.root / "docs"),
             (f"{DOCS}/methods/ours.md", "ablations"): psnr_differences(self.suite, lines, OURS),
             (f"{DOCS}/methods/rgbavatar.md", "further"): beside,
         }
@@ -211,6 +215,57 @@ def mechanisms(runs: Mapping[str, RunSet]) -> str:
             cells += [f"{changed:.1f}", " / ".join(f"{value:+.2f}" for value in worth)]
         lines.append([f"`{label}`", *cells])
     return pipe_table(lines)
+
+
+def matrix(docs: Path) -> str:
+    """Native methods: devices, adapters to the authors' code with licence and parity, and papers that print a row of them.
+
+    Licences and parity are those of the tables of the pages on official methods.
+    """
+    parity = rows_by_name(docs / "explanation" / "methods" / "official.md", 5)
+    licences = rows_by_name(docs / "howto" / "official-programs.md", 4)
+    specs = [plugin.spec for plugin in discover("methods").values() if plugin.spec and plugin.spec.source]
+    printed = printed_by()
+    titles = ["Method", "GPU", "Authors' code", "on a CPU", "Licence of that code", "Papers", "Parity, dB"]
+    lines = [titles, ["---"] * 5 + ["--:", "---"]]
+    natives = [spec for spec in specs if spec.native and spec.name in printed]
+    for spec in sorted(natives, key=lambda spec: -printed[spec.name]):
+        official = next(each for each in specs if not each.native and each.source == spec.source)
+        licence = re.split("[,;]", licences[official.name][-1])[0]
+        measured = parity.get(spec.name)
+        cells = ["yes" if spec.computes_on("cuda") else "no", f"`{official.name}`"]
+        cells += ["shim" if "cpu-shim" in official.summary else "no", licence, str(printed[spec.name])]
+        lines.append([f"`{spec.name}`", *cells, " / ".join(measured[1:3]) if measured else "not measured"])
+    absent = sorted(
+        ((-n, name) for name, n in printed.items() if name not in {s.name for s in specs} and n >= 4)
+    )
+    others = ", ".join(f"{name} ({-number})" for number, name in absent)
+    return f"{pipe_table(lines)}\n\nPrinted by at least four of the {len(papers())} stored papers, and not in headbench: {others}."
+
+
+def rows_by_name(page: Path, columns: int) -> dict[str, list[str]]:
+    """Cells after the first one of the rows of tables with so many columns, by the name in code in the first one."""
+    rows = (re.split(r" *\| *", line)[1:-1] for line in page.read_text(encoding="utf-8").splitlines())
+    return {row[0].strip("`"): row[1:] for row in rows if len(row) == columns and row[0].startswith("`")}
+
+
+def printed_by() -> dict[str, int]:
+    """Number of papers of others that print a row of a method, by registered name or the usual one of its spellings."""
+    sources = {name: plugin.spec.source for name, plugin in discover("methods").items() if plugin.spec}
+    found: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
+    for paper_name, paper in papers().items():
+        for row in (row for table in paper.tables for row in table.rows):
+            bare = row.method or re.sub(r" *[(+,].*", "", row.name)
+            own = bare.lower() in OF_THE_PAPER and not row.method
+            if not own and not (paper.arxiv and paper.arxiv in sources.get(row.method, "")):
+                key = row.method or re.sub("[^a-z0-9]", "", bare.lower()).rstrip("s")
+                found[key][bare].add(paper_name)
+    usual = {key: max(names, key=lambda name: len(names[name])) for key, names in found.items()}
+    return {usual[key]: len(set().union(*names.values())) for key, names in found.items()}
+
+
+OF_THE_PAPER = ("", "ours", "baseline", "full")
+"""Names of rows that are a paper's own method."""
 
 
 def choices(runs: RunSet) -> str:

@@ -12,6 +12,7 @@ from headbench.bench.io.files import digest
 from headbench.bench.protocol import (
     FOLDER,
     NamedProtocol,
+    TaskFrames,
     check_capture,
     evenly_with_ends,
     make_protocol,
@@ -34,7 +35,9 @@ def test_every_protocol_names_its_profile_and_source():
 
 CHANGES = [
     ({"mask": "face"}, "mask: expected one of"),
-    ({"tasks": {"drive": {}}}, "tasks: novel_view or self_reenactment; found drive"),
+    ({"tasks": {"drive": {}}}, "tasks: novel_view, self_reenactment or cross_reenactment; found drive"),
+    ({"tasks": {"cross_reenactment": {}}}, "metrics: CSIM or AED or APD or AKD.*found psnr@ga-training"),
+    ({"tasks": {"novel_view": {"share": 1}}}, "share: between 0 and 1, or null; found 1"),
     ({"tasks": {"novel_view": {"cameras": "new"}}}, "cameras: expected one of .*, found 'new'"),
     ({"tasks": {"novel_view": {"last": 0}}}, "last: at least 1, or null for all; found 0"),
 ]
@@ -46,6 +49,38 @@ def test_a_file_with_a_wrong_key_or_value_is_refused(tmp_path, change, message):
     (tmp_path / "p.yaml").write_text(yaml.safe_dump(content | change))
     with pytest.raises(InputError, match=message):
         build_file(NamedProtocol, tmp_path / "p.yaml")
+
+
+DIGESTS = {
+    "ava-256": "190547d8fa32",
+    "few-images": "090d1c25218b",
+    "hdtf": "e10eac07fb66",
+    "last-10-percent": "b85a585d8289",
+    "vfhq-cross": "333f7ca55c77",
+    "vfhq-self": "661638fea8af",
+}
+
+
+@pytest.mark.parametrize("name", DIGESTS)
+def test_a_protocol_of_pictures_keeps_its_hash(name):
+    protocol = named_protocols()[name]
+    assert digest(name, asdict(protocol))[:12] == DIGESTS[name]
+    assert {metric.partition("@")[0] for metric in protocol.compared} <= {*discover("metrics")}
+    assert protocol.grade
+    assert protocol.unknown
+
+
+def test_a_run_cannot_follow_a_protocol_of_pictures():
+    with pytest.raises(InputError, match="found vfhq-self, whose methods are given 1 picture.*--truth"):
+        needed(["vfhq-self"], {})
+
+
+@pytest.mark.parametrize(("held_out", "trained"), [(10, 90), (10, 89), (11, 94)])
+def test_a_share_is_held_out_to_within_a_frame(held_out, trained):
+    share = TaskFrames(share=0.1)
+    share.check_share(held_out, trained, "clip s", "p")
+    with pytest.raises(InputError, match=r"expected 10 of 100 frames.*found 12.*held_out_frames=10"):
+        share.check_share(12, 88, "clip s", "p")
 
 
 def test_a_run_measures_what_a_protocol_selects():

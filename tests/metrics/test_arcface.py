@@ -32,8 +32,9 @@ def _picture(number, name, shape):
     return _field(number, _field(1, name) + _field(2, _field(1, _field(1, 1) + _field(2, sizes))))
 
 
-def onnx(length=512, channels=3, bias=BIAS):
+def onnx(length=None, channels=3, bias=BIAS, weights=WEIGHTS, side=112):
     """A file of ONNX: the mean colour of a picture, times weights, plus a bias."""
+    length = length or len(bias)
     nodes = (
         ("GlobalAveragePool", ("x",), "mean"),
         ("Flatten", ("mean",), "flat"),
@@ -43,9 +44,9 @@ def onnx(length=512, channels=3, bias=BIAS):
         _field(1, b"".join(_field(1, name) for name in inputs) + _field(2, output) + _field(4, kind))
         for kind, inputs, output in nodes
     )
-    weights = np.resize(WEIGHTS, (channels, WEIGHTS.shape[1]))[:, :length]
+    weights = np.resize(weights, (channels, weights.shape[1]))[:, :length]
     graph += _field(2, "g") + _tensor("w", weights) + _tensor("b", bias[:length])
-    graph += _picture(11, "x", (1, channels, 112, 112)) + _picture(12, "y", (1, length))
+    graph += _picture(11, "x", (1, channels, side, side)) + _picture(12, "y", (1, length))
     return _field(1, 8) + _field(7, graph) + _field(8, _field(2, 13))
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from headbench.bench.errors import InputError, LeftOutError, UnavailableError
-from headbench.metrics import akd, csim, faces
+from headbench.metrics import akd, coefficients, csim, faces
 from headbench.metrics.akd import AkdDlib, AkdPipNet
 from headbench.metrics.csim import CsimArcFace, CsimDlib
 from headbench.metrics.lpips_network import NETWORKS
@@ -103,6 +103,8 @@ def test_csim_is_the_cosine_between_descriptors(dlib):
 def networks(monkeypatch):
     """Stand-ins of networks at dlib's 68 landmarks, which return them, and the angle of the first."""
     monkeypatch.setattr(akd, "_pipnet", lambda: lambda image, landmarks: landmarks)
+    monkeypatch.setattr(akd, "_landmarks_3d", lambda: lambda image, landmarks: landmarks)
+    monkeypatch.setattr(coefficients, "_deep3d", lambda: lambda image, landmarks: landmarks[:67, 0])
     monkeypatch.setattr(
         csim,
         "_arcface",
@@ -112,10 +114,12 @@ def networks(monkeypatch):
 
 def test_networks_of_files_are_shown_the_best_face(dlib, networks):
     assert AkdPipNet()(level(13), level(10)) == pytest.approx(np.hypot(3, 6))
+    assert akd.AkdInsightFace()(level(13), level(10)) == pytest.approx(np.hypot(3, 6))
+    assert coefficients.AedSum()(level(13), level(10)) == pytest.approx(64 * 3)
     assert CsimArcFace()(level(70), level(10)) == pytest.approx(np.cos(np.radians(60)))
 
 
-@pytest.mark.parametrize("metric", [AkdDlib, CsimDlib, AkdPipNet, CsimArcFace])
+@pytest.mark.parametrize("metric", [AkdDlib, CsimDlib, AkdPipNet, CsimArcFace, coefficients.Apd])
 @pytest.mark.parametrize(("image", "truth", "name"), [(0, 9, "render"), (9, 0, "ground truth")])
 def test_a_picture_without_a_face_is_left_out(dlib, networks, metric, image, truth, name):
     with pytest.raises(LeftOutError, match=f"no face is found in the {name}"):
@@ -140,6 +144,13 @@ def test_without_a_package_the_remedy_says_what_to_install(monkeypatch, missing)
         (akd.AkdMediaPipe, akd.VARIABLE, akd.mediapipe_needs, "mediapipe 0.10.21"),
         (AkdPipNet, akd.PIPNET_VARIABLE, akd.pipnet_needs, "epoch59.pth.*meanface.txt"),
         (CsimArcFace, csim.VARIABLE, csim.arcface_needs, "w600k_r50.onnx.*not commercial"),
+        (akd.AkdInsightFace, akd.INSIGHTFACE_VARIABLE, akd.insightface_needs, "1k3d68.onnx.*not commercial"),
+        (
+            coefficients.Aed,
+            coefficients.VARIABLE,
+            coefficients.needs,
+            "epoch_20.pth.*similarity_Lm3D_all.mat",
+        ),
     ],
 )
 def test_without_its_file_the_remedy_says_where_it_is(

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,9 +12,11 @@ import pytest
 from PIL import Image
 
 from headbench.bench import cli
+from headbench.bench.audit import folders as module
 from headbench.bench.audit.folders import _Video
 from headbench.bench.io.images import read_png, write_browser_video, write_png
 from headbench.bench.io.videos import video_frames
+from headbench.bench.protocol import NamedProtocol, TaskFrames
 from headbench.metrics.psnr import psnr
 
 RNG = np.random.default_rng(0)
@@ -101,6 +104,34 @@ def test_renders_are_resized_to_the_truth(folders, capsys, method):
     assert float(rows[2]["l1"]) == pytest.approx(expected, abs=1e-3 if method == "area" else 3e-2)
     if method == "bicubic":
         assert float(rows[2]["l1"]) != pytest.approx(expected, abs=1e-3)
+
+
+def test_a_protocol_chooses_metrics_and_batches(folders, capsys, monkeypatch):
+    protocol = NamedProtocol(
+        "x", "", {"self_reenactment": TaskFrames()}, profile="piq", metrics=("psnr@piq",)
+    )
+    protocol = replace(protocol, pooled=2, size="64x48", crop="none")
+    monkeypatch.setattr(module, "protocol_named", {"p": protocol}.__getitem__)
+    words = ["evaluate", "renders", "--truth", "truth", "--protocol", "p", "--out", "out.csv"]
+    assert cli.main(words) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Protocol p: x. Pixels: 32x24; in the protocol: 64x48. Crop, which is not done here: none." in text
+    data, rows = evaluated(capsys, *words[1:-2])
+    errors = [10 ** (-float(row["psnr@piq"]) / 10) for row in rows]
+    batches = [-10 * np.log10(np.mean(errors[:2])), -10 * np.log10(errors[2])]
+    assert data["mean_of_pairs"]["psnr@piq"] == pytest.approx(np.mean(batches))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["vfhq-cross", "--metrics", "psnr"], "--metrics: expected CSIM or AED or APD or AKD.*found psnr"),
+        (["suite", "vfhq-self"], "--protocol: expected one protocol with --truth, found suite, vfhq-self"),
+    ],
+)
+def test_a_protocol_refuses_what_it_cannot_have(folders, capsys, words, message):
+    assert cli.main(["evaluate", "renders", "--truth", "truth", "--protocol", *words]) == 2
+    assert re.search(message, " ".join(capsys.readouterr().err.split()))
 
 
 FAULTS = {

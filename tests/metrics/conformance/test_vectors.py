@@ -9,6 +9,7 @@ import torch
 
 from headbench.bench.registry import get, resolve
 from headbench.metrics.flip import flip
+from headbench.metrics.lpips import lpips_squeeze
 from headbench.metrics.lpips_network import Lpips
 from headbench.metrics.psnr import psnr, psnr_by_channel, psnr_floored
 from headbench.metrics.ssim import (
@@ -98,6 +99,7 @@ def test_the_training_formula_of_gaussian_splatting_agrees(pair):
         ("3dgs", {"psnr": psnr, "ssim": ssim_zero_border}),
         ("nerfbaselines", {"psnr": psnr, "ssim": ssim}),
         ("gsplat", {"psnr": psnr, "ssim": ssim_reflected}),
+        ("flexavatar", {"psnr": psnr, "ssim": ssim_reflected, "lpips": lpips_squeeze}),
         ("skimage", {"psnr": psnr, "ssim": ssim_uniform}),
         ("piq", {"psnr": psnr_floored, "ssim": ssim_downsampled}),
     ],
