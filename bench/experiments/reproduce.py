@@ -31,6 +31,7 @@ from .specs import MOVED_LINES
 if TYPE_CHECKING:
     from ...datasets.nersemble.names import PrepareSettings
     from ...datasets.nersemble.plan import PreparationPlan
+    from ...reports.claims import JudgedClaim
 
 log = logging.getLogger(__name__)
 OURS = "ours"
@@ -151,28 +152,22 @@ def reproduce(settings: ReproduceSettings, progress: Progress = no_progress) -> 
     plan = _plan(settings, runs, recordings, progress)
     if settings.until == "plan":
         return CommandResult(plan["text"], plan)
-    captures: dict[str, list[Path]] = {}
+    captures: dict[str, dict[str, str]] = {}
     for part in settings.parts:
         prepared = prepare_nersemble(settings.preparation(part), progress)
-        if not prepared.passed:
-            return prepared
-        captures[part] = [Path(each["union"]) for each in prepared.data.values()]
-        _leave_out_tongue(settings, part, [*prepared.data], progress)
+        captures[part] = {subject: str(each["union"]) for subject, each in prepared.data.items()}
+        _leave_out_tongue(settings, part, captures[part], progress)
     if settings.until == "captures":
         sheets = "\n".join(f"Review the frames left out: {folder}" for folder in settings.tongue.values())
         return CommandResult(f"{plan['text']}\n\n{sheets}", {"captures": captures, "plan": plan})
+    _draw_steps(settings, next(iter(captures[COMPARISON].values())), progress)
     failed: set[str] = set()
+    verdicts: Sequence[JudgedClaim] = ()
     for config in runs.values():
         failed |= {*run(config, _execution(settings, config)).rows.failed}
-        _write_claims(
-            settings, runs
-        )  # after every run, so that a killed reproduction has those of the others
-    _draw_steps(settings, captures[COMPARISON][0], progress)
-    verdicts = _write_claims(settings, runs)
-    text = [
-        claims_text(verdicts),
-        f"Plan: {out / 'plan.md'}, claims: {out / CLAIMS}.md, figures: {out / 'figures'}",
-    ]
+        verdicts = _write_claims(settings, runs)  # so that a killed reproduction has those of finished runs
+    files = f"Plan: {out / 'plan.md'}, claims: {out / CLAIMS}.md, figures: {out / 'figures'}"
+    text = [claims_text(verdicts), files]
     data = {"plan": plan, "claims": [verdict.record() for verdict in verdicts], "failed": sorted(failed)}
     return CommandResult("\n\n".join(text), data, not failed)
 
@@ -219,11 +214,10 @@ def _plan(
     out = Path(settings.out)
     made_for = digest({name: value for name, value in settings.others.items() if name != "until"})
     stored = read_json(out / PLAN_FILE) if (out / PLAN_FILE).exists() else {}
-    if is_new := stored.get("settings") != made_for:
-        first = recordings[COMPARISON][0]
-        execution = replace(settings.execution, executor="inline")
-        if settings.execution.executor == "slurm":
-            execution = settings.execution
+    if stored.get("settings") != made_for:
+        first, execution = recordings[COMPARISON][0], settings.execution
+        if execution.executor != "slurm":
+            execution = replace(execution, executor="inline")  # trainings at once would take longer
         rates = measure(runs, first, settings.timed, execution, out / "plan", progress)
         write_json(out / PLAN_FILE, {"settings": made_for, "rates": asdict(rates)})
     else:
@@ -232,15 +226,17 @@ def _plan(
     free = shutil.disk_usage(out).free
     how = (
         f"Measured on {TIMESTEPS} timesteps of a training sequence and the held-out one of subject "
-        f"{recordings[COMPARISON][0].subject} with {settings.timed} iterations, on one device. Trainings slow down as splats are added: a lower bound."
+        f"{recordings[COMPARISON][0].subject} with {settings.timed} iterations, on one device. Trainings slow down as splats are "
+        "added: a lower bound."
     )
     table = pipe_table(found.pop("lines"))
     text = f"{table}\n\n{how} {found['bytes'] / 1e9:.3g} GB to write, {free / 1e9:.1f} GB free."
-    if is_new and settings.until != "plan" and free < found["bytes"]:
-        raise InputError(out, "", f"{found['bytes'] / 1e9:.1f} GB of free space", f"{free / 1e9:.1f} GB")
     write_text(out / "plan.md", f"{text}\n")
     if settings.until != "plan":
         log.info("%s", text)  # before hours of work
+        if not (out / "captures").exists() and free < found["bytes"]:
+            expected = f"{found['bytes'] / 1e9:.1f} GB of free space"
+            raise InputError(out, "", expected, f"{free / 1e9:.1f} GB", "Give an --out on another disk.")
     return {**found, "text": text}
 
 
@@ -260,7 +256,7 @@ def _execution(settings: ReproduceSettings, config: RunConfig) -> Execution:
 
 
 def _leave_out_tongue(
-    settings: ReproduceSettings, part: str, subjects: Sequence[str], progress: Progress
+    settings: ReproduceSettings, part: str, captures: Mapping[str, str], progress: Progress
 ) -> None:
     """Find the frames that show the tongue, unless that is done; decisions that a person has changed are kept."""
     from ...datasets.steps.exclude import read_exclusions
@@ -268,19 +264,21 @@ def _leave_out_tongue(
 
     out = settings.tongue[part]
     path = out / DECISIONS_FILE
-    if not path.exists() or {*subjects} - {*read_exclusions(path)}:
-        tongue(TongueSettings(settings.preparation(part).out, str(out), head=settings.head), progress)
+    decided = read_exclusions(path) if path.exists() else {}
+    for subject, capture in captures.items():
+        if subject not in decided:
+            tongue(TongueSettings(capture, str(out), head=settings.head), progress)
 
 
-def _draw_steps(settings: ReproduceSettings, capture: Path, progress: Progress) -> None:
+def _draw_steps(settings: ReproduceSettings, capture: str, progress: Progress) -> None:
     """Figures 7 and 8: jaw bases and expression clusters of the first subject."""
     from ...datasets.inspect.command import StepsSettings, steps
 
-    chosen = StepsSettings(str(capture), str(Path(settings.out) / "figures"), head=settings.head)
+    chosen = StepsSettings(capture, str(Path(settings.out) / "figures"), head=settings.head)
     steps(replace(chosen, set=(f"exclude={settings.tongue[COMPARISON] / 'tongue.yaml'}",)), progress)
 
 
-def _write_claims(settings: ReproduceSettings, runs: Mapping[str, RunConfig]) -> Sequence[Any]:
+def _write_claims(settings: ReproduceSettings, runs: Mapping[str, RunConfig]) -> Sequence[JudgedClaim]:
     """Judge the claims by the finished runs, write them, and return the verdicts."""
     from ...reports.claims import claims_text, judge, values_text
     from ...reports.papers import paper_named
@@ -295,16 +293,12 @@ def _write_claims(settings: ReproduceSettings, runs: Mapping[str, RunConfig]) ->
         if folders:
             read = RunSet.read(folders)
             finished[part] = under(read, settings.paper, protocol_named(settings.paper))
-    tables = {
-        table.table: ABLATION if table.table == ABLATION_TABLE else COMPARISON for table in paper.tables
-    }
-    verdicts = judge(paper, {table: finished[part] for table, part in tables.items() if part in finished})
-    conditions = [
-        f"{part}: {', '.join(sorted(read.rows.subjects))}. {read.part}" for part, read in finished.items()
-    ]
-    text = "\n\n".join(
-        [f"# Claims of {paper.citation}", claims_text(verdicts), values_text(verdicts), *conditions]
-    )
+    of_table = {t.table: ABLATION if t.table == ABLATION_TABLE else COMPARISON for t in paper.tables}
+    verdicts = judge(paper, {table: finished[part] for table, part in of_table.items() if part in finished})
+    parts = [f"# Claims of {paper.citation}", claims_text(verdicts), values_text(verdicts)]
+    for part, read in finished.items():
+        parts.append(f"{part}: subjects {', '.join(sorted(read.rows.subjects))}. {read.part}")
+    text = "\n\n".join(parts)
     write_text(Path(settings.out) / f"{CLAIMS}.md", f"{text}\n")
     write_json(Path(settings.out) / f"{CLAIMS}.json", [verdict.record() for verdict in verdicts])
     return verdicts

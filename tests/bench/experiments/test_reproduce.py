@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -72,6 +73,25 @@ def test_amounts_are_those_of_the_recordings(tmp_path):
     assert [(job.count, job.tracked.count, job.folder.parent.name) for job in sample.jobs] == (
         [(2, 2, "sample")] * 2
     )
+
+
+def test_a_sequence_without_tracking_is_named_first(tmp_path, capsys):
+    recording = write_recording(tmp_path)
+    shutil.rmtree(recording.tracking / "901_FREE_v3_DS2_wBg")
+    words = [
+        "run",
+        "reproduce",
+        "tensorial-2025",
+        "--data",
+        str(recording.root),
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    words += ["--tracking", str(recording.tracking), "--head", str(recording.head), "--methods", "ga"]
+    words += ["--subjects", "901", "--ablation", "", "--sequences", "EMO-1,FREE", "--device", "cpu"]
+    assert cli.main(words) == 2
+    assert "901 FREE: expected VHAP's tracked_flame_params_*.npz, found none" in capsys.readouterr().err
+    assert not (tmp_path / "o" / "plan").exists()
 
 
 def rehearsal(folder: Path) -> list[str]:
