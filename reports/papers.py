@@ -126,20 +126,58 @@ class PrintedTable:
 
 
 @dataclass(frozen=True)
+class Claim:
+    """A statement of a paper about a row of one of its tables, which measured values confirm or not, see `claims.judge`.
+
+    ``values`` are tolerances by the keys of the row, in the unit of the metric. "near": a measured value differs from the printed
+    one by at most the tolerance; "reaches": it is not worse than that; "sign": its difference from that of the row ``than`` has the
+    sign of the printed difference, and is larger than the tolerance.
+    """
+
+    id: str
+    text: str
+    table: str
+    row: str
+    comparison: Literal["near", "reaches", "sign"]
+    values: dict[str, float]
+    than: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse a sign without a second row, and no values."""
+        if (self.comparison == "sign") != bool(self.than):
+            raise ValueError(f"than: a row for a comparison by sign, and for no other; found {self.than!r}")
+        if not self.values:
+            raise ValueError("values: at least one; found none")
+
+
+@dataclass(frozen=True)
 class Paper:
-    """A paper and its tables of results; ``arxiv`` is its number there, None without one."""
+    """A paper, its tables of results and its claims; ``arxiv`` is its number there, None without one."""
 
     title: str
     venue: str
     arxiv: str | None
     tables: tuple[PrintedTable, ...]
+    claims: tuple[Claim, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse a paper without tables."""
+        """Refuse a paper without tables, and claims about values that are not in them."""
         if self.arxiv is not None and not re.fullmatch(r"\d{4}\.\d{4,5}", self.arxiv):
             raise ValueError(f"arxiv: a number such as 2504.14967, in quotes, or null; found {self.arxiv!r}")
         if not self.tables:
             raise ValueError("tables: at least one; found none")
+        printed = {
+            (table.table, row.name, key): float(text)
+            for table in self.tables
+            for row in table.rows
+            for key, text in row.values.items()
+        }
+        for claim, key in ((each, key) for each in self.claims for key in each.values):
+            for row in filter(None, (claim.row, claim.than)):
+                if (claim.table, row, key) not in printed:
+                    raise ValueError(f"claims, {claim.id}: printed values; found {claim.table}, {row}, {key}")
+            if claim.than and printed[claim.table, claim.row, key] == printed[claim.table, claim.than, key]:
+                raise ValueError(f"claims, {claim.id}: a printed difference; found equal values of {key}")
 
     @property
     def citation(self) -> str:

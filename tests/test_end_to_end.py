@@ -366,6 +366,7 @@ CASES = {
         case("doctor", r"(?s)ours +ready.*All default methods can run here"),
         case("doctor gha --device cpu", "The methods named can run here"),
     ],
+    "run reproduce": [],  # in tests/bench/experiments, with recordings
     "run parity": [],  # in tests/methods/official, with a stand-in for the authors' repository
     "prepare benchmark": [],  # these four in tests/datasets/nersemble, with a benchmark's folder
     "submission render": [],

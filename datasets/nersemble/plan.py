@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -164,6 +164,21 @@ def plan_subject(settings: PrepareSettings, subject: str) -> PreparationPlan:
     label = f"v{len(jobs[0].cameras)}_DS{settings.downscale}"
     union = out / f"UNION{len(jobs)}_{subject}_{label}_{settings.split}-test"
     return PreparationPlan(subject, jobs, test, head, version, union)
+
+
+def shortened(plan: PreparationPlan, timesteps: int, out: Path) -> PreparationPlan:
+    """The first timesteps of one training sequence and of the held-out ones, in another folder: a sample to time."""
+    trained = next(job for job in plan.jobs if job.recorded.name not in plan.test)
+    jobs = []
+    for job in (trained, *(job for job in plan.jobs if job.recorded.name in plan.test)):
+        recorded, tracked = job.recorded, job.tracked
+        numbers = recorded.numbers[:timesteps]
+        if tracked is not None:
+            frames = {key: values[:timesteps] for key, values in tracked.frames.items()}
+            tracked = replace(tracked, frames=frames)
+        recorded = replace(recorded, numbers=numbers, uncut=numbers)
+        jobs.append(replace(job, recorded=recorded, tracked=tracked, folder=out / job.folder.name))
+    return replace(plan, jobs=jobs, union=out / plan.union.name)
 
 
 def _head_version(settings: PrepareSettings, head: HeadArrays | None) -> str:

@@ -11,9 +11,10 @@ from headbench.bench.io.files import write_json, write_text
 from headbench.datasets.head.arrays import HeadArrays, save_head
 from headbench.datasets.images import write_image
 from headbench.datasets.nersemble.names import PrepareSettings
+from headbench.datasets.nersemble.recording import read_calibration
 
 from ..head.toy import toy_head
-from ..tiny_capture import rig
+from ..tiny_capture import make_plan, paint, rig
 
 SUBJECT = "901"
 SEQUENCES = {"EMO-1-shout+laugh": 4, "FREE": 6}
@@ -59,6 +60,7 @@ class Recording:
 
     folder: Path
     release: str = "v2"
+    subject: str = SUBJECT
 
     @property
     def root(self) -> Path:
@@ -74,18 +76,22 @@ class Recording:
 
     @property
     def calibration_file(self) -> Path:
-        places = {"v2": f"{SUBJECT}/calibration", "v1": f"camera_params/{SUBJECT}", "paper2023": SUBJECT}
+        places = {
+            "v2": f"{self.subject}/calibration",
+            "v1": f"camera_params/{self.subject}",
+            "paper2023": self.subject,
+        }
         return self.root / places[self.release] / "camera_params.json"
 
     def sequence_folder(self, sequence: str) -> Path:
-        return self.root / SUBJECT / ("" if self.release == "v1" else "sequences") / sequence
+        return self.root / self.subject / ("" if self.release == "v1" else "sequences") / sequence
 
     def settings(self, out: Path, **changes) -> PrepareSettings:
         """Settings that prepare all of it."""
         values = {
             "root": str(self.root),
             "out": str(out),
-            "subjects": SUBJECT,
+            "subjects": self.subject,
             "sequences": "EMO-1,FREE",
             "downscale": 2,
             "tracking": str(self.tracking),
@@ -107,7 +113,7 @@ class Recording:
         write_image(self.sequence_folder("BACKGROUND") / f"image_{serial}.jpg", rgb, *_JPEG)
 
     def write_metadata(self, sequences: list[str]) -> None:
-        rows = ["ID", "wears_glasses", *sequences], [SUBJECT, "", *("x" for _ in sequences)]
+        rows = ["ID", "wears_glasses", *sequences], [self.subject, "", *("x" for _ in sequences)]
         write_text(self.root / "metadata_sequences.csv", "".join(",".join(row) + "\n" for row in rows))
 
     def write_video(self, sequence: str, serial: str, frames) -> None:
@@ -193,4 +199,36 @@ def write_recording(
                 recording.write_video(name, camera.id, frames)
         path = recording.tracking / f"{SUBJECT}_{name}_v3_DS2_wBg" / "2026-01-01_00-00-00"
         write_tracked(path / "tracked_flame_params_30.npz", tracked_arrays(head, count))
+    return recording
+
+
+TRACKED = {
+    "translation": "translation",
+    "rotation": "rotation",
+    "neck_pose": "neck",
+    "jaw_pose": "jaw",
+    "eyes_pose": "eyes",
+    "expr": "expression",
+}
+"""Attribute of a pose by VHAP's name."""
+
+
+def write_painted(
+    folder: Path, subject: str, head: HeadArrays, *, size: tuple[int, int], seed: int
+) -> Recording:
+    """Write a recording that shows its tracked head: pixels and masks are those of its silhouette."""
+    recording = Recording(folder, subject=subject)
+    recording.write_calibration(world_cameras(*size))
+    calibration = read_calibration(recording.calibration_file).aligned()
+    cameras = [calibration.camera(serial, size, size) for serial in calibration.serials]
+    plan = make_plan(head=head, lengths=SEQUENCES, cameras=cameras, seed=seed)
+    for sequence in plan.sequences:
+        for number, pose in enumerate(sequence.poses):
+            for index, camera in enumerate(cameras):
+                picture = paint(plan, pose, camera, seed + 3 * number + index)
+                recording.write_frame(sequence.name, camera.id, number, *picture)
+        arrays = {key: np.stack([getattr(p, name) for p in sequence.poses]) for key, name in TRACKED.items()}
+        arrays |= {"shape": plan.shape, "static_offset": plan.static_offset[None]}
+        path = recording.tracking / f"{subject}_{sequence.name}_v3_DS2_wBg" / "2026-01-01_00-00-00"
+        write_tracked(path / "tracked_flame_params_30.npz", arrays)
     return recording
