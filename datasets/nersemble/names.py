@@ -181,7 +181,7 @@ def union10_held_out(subject: str) -> str:
     return UNION10_SEQUENCES[random.Random(subject).randint(0, len(UNION10_SEQUENCES) - 1)]
 
 
-def chosen_subjects(text: str) -> list[str]:
+def chosen_subjects(text: str, option: str = "--subjects") -> list[str]:
     """Subject ids of an option: ids separated by commas, ``paper`` (the nine) or ``ablation``. Numbers are padded to
     three digits, so 74 is 074."""
     if text in SUBJECT_NAMES:
@@ -189,8 +189,8 @@ def chosen_subjects(text: str) -> list[str]:
     ids = [part.strip() for part in text.split(",") if part.strip()]
     if not ids or not all(part.isascii() and part.isdigit() for part in ids):
         expected = 'numbers separated by commas, "paper" or "ablation"'
-        raise InputError("command line", "--subjects", expected, repr(text))
+        raise InputError("command line", option, expected, repr(text))
     padded = [part.zfill(3) for part in ids]
     if len(set(padded)) != len(padded):
-        raise InputError("command line", "--subjects", "every subject once", repr(text))
+        raise InputError("command line", option, "every subject once", repr(text))
     return padded

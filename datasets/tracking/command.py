@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -9,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...bench.contracts import Progress, no_progress
+from ...bench.errors import InputError
+from ...bench.io.documents import checked, read_json
 from ...bench.io.files import write_json
 from ...bench.landmark_network import LICENCE, WHEEL, fetch_networks
 from ...bench.manifest import cut_of
@@ -62,6 +65,8 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     out = Path(settings.out)
     work = out / WORK
     check_work_folder(work)
+    used = {name: value for name, value in asdict(settings).items() if name not in ("out", "against")}
+    _check_same_settings(out / REPORT, used)
     if is_video(Path(settings.capture)):
         video = video_to_track(settings, work, progress)
         clip = video.clip
@@ -105,13 +110,14 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     timesteps = evenly_with_ends([residual.timestep for residual in tracked.report.residuals], ROWS)
     overlay = draw_overlay(tracked.clip, timesteps, evenly_with_ends(cameras, COLUMNS))
     write_image(out / PICTURE, overlay)
-    union = write_capture(tracked.clip, out, progress)
+    union = _moved(write_capture(tracked.clip, work / "capture", progress), out)
     if video is not None:
         video.data["video"]["frames_used"] = [
             video.numbers[residual.timestep] for residual in tracked.report.residuals
         ]
     data: dict[str, Any] = {
         "capture": union.as_posix(),
+        "settings": used,
         "cut": cut_of(map(asdict, tracked.clip.steps)),
         **notes,
         **(video.data if video else {}),
@@ -125,6 +131,28 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     write_json(out / REPORT, data)
     shutil.rmtree(work)
     return CommandResult("\n".join([*lines, f"Capture: {union}"]), data)
+
+
+def _check_same_settings(report: Path, used: Mapping[str, Any]) -> None:
+    """Raise `InputError` if there is a tracking by other settings, whose capture would be mixed with the new one."""
+    if not report.is_file():
+        return
+    known = checked(read_json(report).get("settings"), dict[str, Any], report, "settings")
+    wanted = json.loads(json.dumps(used))
+    if other := [name for name in wanted if known.get(name) != wanted[name]]:
+        name = other[0]
+        remedy = "Give another --out, or delete the folder."
+        raise InputError(report, f"settings.{name}", repr(wanted[name]), repr(known.get(name)), remedy)
+
+
+def _moved(union: Path, out: Path) -> Path:
+    """Move a whole capture to ``out`` in place of an earlier one, its union last; returns the union's folder."""
+    for folder in sorted(union.parent.iterdir(), key=lambda path: path == union):
+        target = out / folder.name
+        if target.exists():
+            shutil.rmtree(target)
+        folder.replace(target)
+    return out / union.name
 
 
 def _text(tracked: Tracked, numbers: Sequence[int] | None) -> list[str]:

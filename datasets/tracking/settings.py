@@ -108,6 +108,8 @@ class VideoOptions:
             raise ValueError(f"size is {self.size}; from 64 to 4096")
         if self.longest is not None and self.longest < 1:
             raise ValueError(f"longest is {self.longest}; at least 1")
+        if self.held_out_frames is not None and self.held_out_frames < 1:
+            raise ValueError(f"held_out_frames is {self.held_out_frames}; at least 1")
 
 
 @dataclass(frozen=True)

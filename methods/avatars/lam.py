@@ -28,7 +28,7 @@ import torch
 
 from ...bench.contracts import FloatArray, HeadPose, Progress, no_progress
 from ...bench.errors import InputError
-from ...bench.io.files import check_output_folder, check_writable, write_json
+from ...bench.io.files import check_output_folder, check_writable, entries, write_json
 from ...bench.io.provenance import RENDER, note
 from ...bench.specs import CommandResult, command
 from ...datasets.drive.signal import ARKIT, AVATAR, SignalRequest, apply_blendshapes, arkit_columns
@@ -274,6 +274,8 @@ def export_lam(settings: ExportLamSettings, progress: Progress = no_progress) ->
         check_writable(out, "--out")
     else:
         check_output_folder(out)
+        if others := [path.name for path in entries(out) if path.name not in FILES]:
+            raise InputError(out, "", "a new folder, or that of an earlier export", f"also {others[0]}")
     _, head, source, _ = open_source(settings, progress)
     count = len(source.avatar.splats(source.rest).means)
     if count > MOST_SPLATS:

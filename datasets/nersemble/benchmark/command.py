@@ -59,9 +59,14 @@ def prepare_benchmark(settings: BenchmarkPrepareSettings, progress: Progress = n
 
     data, track, out = Path(settings.data), TRACKS[settings.track], Path(settings.out)
     root = data / track.name
-    if settings.every < 1:
-        raise InputError("command line", "--every", "a number from 1", f"{settings.every}")
-    subjects = chosen_subjects(settings.participants) if settings.participants else [*participants(root)]
+    for key, least in (("every", 1), ("workers", 0)):
+        if (value := getattr(settings, key)) < least:
+            raise InputError("command line", f"--{key}", f"a number from {least}", f"{value}")
+    subjects = (
+        chosen_subjects(settings.participants, "--participants")
+        if settings.participants
+        else [*participants(root)]
+    )
     check_kind(out, "captures")
     head = load_head(settings.head)
     plans = [

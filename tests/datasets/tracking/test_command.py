@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from headbench.bench.errors import InputError
-from headbench.bench.io.files import TEMPORARY
+from headbench.bench.io.files import TEMPORARY, write_text
 from headbench.datasets.ga.reader import read_capture
 from headbench.datasets.images import read_image
-from headbench.datasets.tracking.command import track_capture
+from headbench.datasets.tracking.command import _moved, track_capture
 from headbench.datasets.tracking.settings import WORK, TrackSettings, make_work_folder
 
 
@@ -40,6 +40,26 @@ def test_report_and_picture(finished):
     assert f"{stored['errors_mm']['face']['absolute']:.2f}" in result.text
     height, width, _ = read_image(out / "overlay.png", (1, 1, 1)).shape
     assert (height, width) == (3 * 160, 2 * 3 * 120)
+
+
+@pytest.mark.commands
+def test_a_folder_tracked_by_other_settings_is_left_alone(finished, patterned_capture):
+    out, _ = finished
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    with pytest.raises(InputError, match="settings.seed: expected 1, found 0"):
+        track_capture(TrackSettings(str(patterned_capture.union), str(out), seed=1))
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+
+
+def test_a_whole_capture_takes_the_place_of_an_earlier_one(tmp_path):
+    out, staged = tmp_path / "out", tmp_path / "staged"
+    for home, names in ((out, ("0", "1")), (staged, ("0",))):
+        for name in names:
+            write_text(home / "901_FREE" / "images" / f"{name}.png", home.name)
+        write_text(home / "UNION1_901" / "transforms_train.json", home.name)
+    assert _moved(staged / "UNION1_901", out) == out / "UNION1_901"
+    found = {str(path.relative_to(out)): path.read_text() for path in out.rglob("*") if path.is_file()}
+    assert found == {"901_FREE/images/0.png": "staged", "UNION1_901/transforms_train.json": "staged"}
 
 
 @pytest.mark.parametrize("kind", ["a link", "a file", "files of something else"])

@@ -185,6 +185,12 @@ def test_avatars_beyond_the_viewers_texture_are_refused(source, tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
+def test_folders_of_something_else_are_refused(tmp_path):
+    (tmp_path / "mine.txt").touch()
+    with pytest.raises(InputError, match="that of an earlier export, found also mine.txt"):
+        lam.export_lam(ExportLamSettings("avatar", str(tmp_path)))
+
+
 def test_archives_have_an_entry_for_their_folder(exported):
     home, result = exported
     with zipfile.ZipFile(home / "face.zip") as archive:
