@@ -55,7 +55,7 @@ def test_every_option_of_the_help_has_an_entry(entries, capsys):
     assert installed("commands")
     for command in sorted(installed("commands")):
         assert cli.main([*command.split(), "--help"]) == 0
-        shown = re.findall(r"^[│|]? {1,2}(--[a-z][a-z-]*)(?=\s|│)", capsys.readouterr().out, re.MULTILINE)
+        shown = re.findall(r"^[│|]? {1,2}(--[a-z][a-z0-9-]*)(?=\s|│)", capsys.readouterr().out, re.MULTILINE)
         page = f"commands/{command.replace(' ', '-')}"
         listed = {name for of, name in entries["option"] if of == page and name.startswith("--")}
         assert set(shown) - {"--help"} == listed, command
