@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 from .contracts import Progress
 from .terminal import wrapped
@@ -375,6 +375,13 @@ def _line() -> Iterator[Show]:
             display.show(position())
 
         yield show
+
+
+def some(names: Iterable[Any], limit: int = 4) -> str:
+    """The first few names, and the number of others."""
+    names = [str(name) for name in names]
+    rest = len(names) - limit
+    return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def counted(number: int, noun: str) -> str:

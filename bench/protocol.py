@@ -36,7 +36,7 @@ class TaskFrames:
     """Share of all frames that a capture holds out for the task, to within one frame."""
 
     def __post_init__(self) -> None:
-        """Refuse a number of timesteps below 1, and a share that is none or all."""
+        """Refuse a number of timesteps below 1, and a share that is not between 0 and 1."""
         if self.last is not None and self.last < 1:
             raise ValueError(f"last: at least 1, or null for all; found {self.last}")
         if self.share is not None and not 0 < self.share < 1:

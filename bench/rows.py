@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from .condition import label_of
-from .contracts import IntArray
+from .contracts import FloatArray, IntArray
 from .errors import InputError, shortened
 from .io.files import atomic_path, open_regular, reading
 
@@ -86,6 +86,13 @@ class All(Enum):
 
 ALL: Final = All.ALL
 """Selects every value of an argument of `Rows.select`."""
+
+
+def batch_means(values: FloatArray, count: int, *, decibels: bool) -> FloatArray:
+    """Means of (N,) values over batches of ``count`` consecutive ones; of decibels those of the mean squared error."""
+    batch = np.arange(len(values)) // count
+    means: FloatArray = np.bincount(batch, 10 ** (-values / 10) if decibels else values) / np.bincount(batch)
+    return -10 * np.log10(means) if decibels else means
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,11 +370,9 @@ class Rows:
         groups = ["method", "condition", "seed", "task", "subject", "metric", "region"]
         for key, group in frames.sort_values(FRAME).groupby(groups, sort=False):
             numbers = group["value"].to_numpy()
-            error = key[5] in decibels  # type: ignore[index]
+            means = batch_means(numbers, count, decibels=key[5] in decibels)  # type: ignore[index]
             batch = np.arange(len(numbers)) // count
             sizes = np.bincount(batch)
-            means = np.bincount(batch, 10 ** (-numbers / 10) if error else numbers) / sizes
-            means = -10 * np.log10(means) if error else means
             values[group.index] = (means * len(numbers) / (len(sizes) * sizes))[batch]
         return Rows(table.assign(value=values))
 

@@ -70,7 +70,7 @@ class Landmarks3D:
         scale = SIDE / (MARGIN * max(right - left, bottom - top))
         shift = SIDE / 2 - scale * np.array([left + right, top + bottom]) / 2
         turn = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
-        points = self._network(image, turn, SIDE).reshape(-1, 3)[-POINTS:] * SIDE / 2
+        points = self._network(image, turn).reshape(-1, 3)[-POINTS:] * SIDE / 2
         points[:, :2] += SIDE / 2 - shift
         return points / scale
 

@@ -39,7 +39,7 @@ class ArcFace:
 
     def __call__(self, image: ByteArray, landmarks: FloatArray) -> FloatArray:
         """(512,) embedding of the face in an (H, W, 3) 8-bit RGB image with (68, 2) landmarks of 300-W, pixels."""
-        return self._network(image, alignment(five_points(landmarks), PLACES), SIDE)
+        return self._network(image, alignment(five_points(landmarks), PLACES))
 
 
 def five_points(landmarks: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ from ..bench.contracts import ByteArray, FloatArray
 from ..bench.errors import InputError
 from ..bench.io.arrays import check_numbers
 from ..bench.io.files import read_bytes, reading
-from .lpips_network import read_weights
+from .lpips_network import with_weights
 
 SIDE = 224
 """Side of the network's input, pixels."""
@@ -41,11 +41,7 @@ class Deep3D:
 
     def __init__(self, path: Path):
         self._mean_face = five_corners(read_landmarks(path.with_name(LANDMARKS_FILE)))
-        network = CoefficientNetwork()
-        state = network.state_dict()
-        shapes = {name: tuple(value.shape) for name, value in state.items() if value.is_floating_point()}
-        network.load_state_dict(state | read_weights(path, shapes, "net_recon"))
-        self._network = network.eval().requires_grad_(False)
+        self._network = with_weights(CoefficientNetwork(), path, "net_recon")
 
     def __call__(self, image: ByteArray, landmarks: FloatArray) -> FloatArray:
         """(67,) coefficients of the face in an (H, W, 3) 8-bit RGB image with (68, 2) landmarks of 300-W, pixels.

@@ -132,7 +132,7 @@ class OnnxNetwork:
 
     def __init__(self, path: Path, side: int, length: int, shift: float = 0.0, scale: float = 1.0):
         """Read the file; pixels p are given to the network as ``(p - shift) / scale``."""
-        self._shift, self._scale = shift, scale
+        self._side, self._shift, self._scale = side, shift, scale
         expected = f"a network of ONNX that maps a picture of {side}x{side} pixels to {length} numbers"
         content = read_bytes(path, expected)
         with reading(path, expected):
@@ -145,11 +145,11 @@ class OnnxNetwork:
         if not np.isfinite(found).all():
             raise InputError(path, "", expected, "numbers that are not finite")
 
-    def __call__(self, image: ByteArray, turn: FloatArray, side: int) -> FloatArray:
-        """Numbers of the crop of an (H, W, 3) 8-bit RGB image that its (2, 3) affine map to (side, side) pixels defines."""
+    def __call__(self, image: ByteArray, turn: FloatArray) -> FloatArray:
+        """Numbers of the crop of an (H, W, 3) 8-bit RGB image that its (2, 3) affine map to the network's pixels defines."""
         import cv2
 
-        return self._run(np.asarray(cv2.warpAffine(image, turn, (side, side)), np.uint8))[0]
+        return self._run(np.asarray(cv2.warpAffine(image, turn, (self._side, self._side)), np.uint8))[0]
 
     def _run(self, crop: ByteArray) -> FloatArray:
         pixels = (crop.astype(np.float32) - self._shift) / self._scale

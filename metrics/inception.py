@@ -21,7 +21,7 @@ from PIL import Image
 from torch import Tensor, nn
 
 from ..bench.contracts import ByteArray, FloatArray
-from .lpips_network import read_weights
+from .lpips_network import with_weights
 
 SIDE = 299
 """Side of the network's input, pixels."""
@@ -33,11 +33,7 @@ class Inception:
 
     def __init__(self, path: Path, device: str = "cpu") -> None:
         self._device = torch.device(device)
-        network = InceptionNetwork()
-        state = network.state_dict()
-        shapes = {name: tuple(value.shape) for name, value in state.items() if value.is_floating_point()}
-        network.load_state_dict(state | read_weights(path, shapes))
-        self._network = network.eval().requires_grad_(False).to(self._device)
+        self._network = with_weights(InceptionNetwork(), path).to(self._device)
 
     def __call__(self, images: Sequence[ByteArray]) -> FloatArray:
         """(N, 2048) features of (H, W, 3) 8-bit images."""

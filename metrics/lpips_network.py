@@ -38,6 +38,7 @@ from http.client import HTTPException
 from itertools import groupby, islice
 from pathlib import Path
 from pickle import UnpicklingError
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -67,6 +68,17 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]], entry: str =
     if not isinstance(content, dict):
         raise InputError(path, entry, "a dictionary of tensors", type(content).__name__)
     return {name: _tensor(path, name, content.get(name), shape) for name, shape in shapes.items()}
+
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def with_weights(network: Network, path: Path, entry: str = "") -> Network:
+    """The network for inference with the weights of a file, see `read_weights`, whose names are those of its tensors."""
+    state = network.state_dict()
+    shapes = {name: tuple(value.shape) for name, value in state.items() if value.is_floating_point()}
+    network.load_state_dict(state | read_weights(path, shapes, entry))
+    return network.eval().requires_grad_(False)
 
 
 def _tensor(path: Path, name: str, value: object, shape: tuple[int, ...]) -> Tensor:

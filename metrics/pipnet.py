@@ -22,7 +22,7 @@ from ..bench.contracts import ByteArray, FloatArray, IntArray
 from ..bench.errors import InputError
 from ..bench.io.arrays import check_numbers
 from ..bench.io.files import read_bytes, reading
-from .lpips_network import read_weights
+from .lpips_network import with_weights
 
 COUNT = 98
 NEIGHBOURS = 10
@@ -41,11 +41,7 @@ class PipNet:
     def __init__(self, path: Path):
         self._mean_face = read_mean_face(path.with_name(MEAN_FACE))
         self._votes = votes(self._mean_face)
-        network = Network()
-        state = network.state_dict()
-        shapes = {name: tuple(value.shape) for name, value in state.items() if value.is_floating_point()}
-        network.load_state_dict(state | read_weights(path, shapes))
-        self._network = network.eval().requires_grad_(False)
+        self._network = with_weights(Network(), path)
 
     def __call__(self, image: ByteArray, landmarks: FloatArray) -> FloatArray | None:
         """As `find_in`, in the box of (N, 2) landmarks of a face, which extend from ear to ear and from brows to chin."""

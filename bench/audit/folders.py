@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,14 +19,14 @@ from ..contracts import BoolArray, ByteArray, FrameKey, Progress
 from ..engine.config import default_names
 from ..engine.scoring import FACE, Score, ScoredFrames, score_frames
 from ..errors import InputError
-from ..io.files import check_writable, entries, write_text
+from ..io.files import check_writable, entries, natural_order, write_text
 from ..io.images import probe_image, read_pixels, read_png
 from ..io.videos import SUFFIXES, video_frames
 from ..machine import processor_count
-from ..progress import counted
+from ..progress import counted, some
 from ..protocol import NamedProtocol, protocol_named
 from ..registry import get
-from ..rows import FULL
+from ..rows import FULL, batch_means
 from ..specs import CommandResult, MetricSpec
 from ..terminal import table
 from .frames import csv_text
@@ -58,6 +56,8 @@ class Pair(NamedTuple):
     mask: Path | None
     frame: int | None
     """Number of the frame in the videos; None for images."""
+    size: tuple[int, int]
+    """(width, height) of the ground truth."""
 
 
 class Extent(NamedTuple):
@@ -84,7 +84,7 @@ def find_pairs(
         for other, theirs in list(zip(folders, found))[:2]:
             if missing := [name for name in theirs if name not in files]:
                 expected = f"a file for each of the {len(theirs)} in {other}, of the same name without suffix"
-                raise InputError(folder, "", expected, f"none for {_listed(missing)}")
+                raise InputError(folder, "", expected, f"none for {some(missing, NAMED)}")
     pairs: list[Pair] = []
     places: Counter[str] = Counter()
     for number, name in enumerate(found[0], 1):
@@ -96,9 +96,9 @@ def find_pairs(
             places[sequence] += 1
             mask = paths[2] if masks is not None else None
             if extent.frames is None:
-                pairs.append(Pair(key, name, paths[0], paths[1], mask, None))
+                pairs.append(Pair(key, name, paths[0], paths[1], mask, None, extent[:2]))
             else:
-                pairs.append(Pair(key, f"{name}/{frame:05d}", paths[0], paths[1], mask, frame))
+                pairs.append(Pair(key, f"{name}/{frame:05d}", paths[0], paths[1], mask, frame, extent[:2]))
         progress(number, len(found[0]), "checking sizes")
     return sorted(pairs, key=lambda pair: pair.key)
 
@@ -121,16 +121,7 @@ def _files(root: Path, name: str) -> dict[str, Path]:
     if not files:
         suffixes = ", ".join((*IMAGES, *SUFFIXES))
         raise InputError(root, "", f"a folder with images or videos ({suffixes})", "none")
-    return dict(sorted(files.items(), key=lambda item: _numbers_in_order(item[0])))
-
-
-def _numbers_in_order(name: str) -> list[str | int]:
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
+    return dict(sorted(files.items(), key=lambda item: natural_order(item[0])))
 
 
 def _check_extents(paths: Sequence[Path], resize: Resize | None) -> Extent:
@@ -200,12 +191,9 @@ class PairedImages:
         """(H, W, 3) 8-bit sRGB of the ground truth's size."""
         pair = self._pairs[key]
         image = self._read(pair.render, pair.frame)
-        if self._resize is None:
+        if self._resize is None or image.shape[1::-1] == pair.size:
             return image
-        height, width = self.image(key).shape[:2]
-        if image.shape[:2] == (height, width):
-            return image
-        return np.asarray(Image.fromarray(image).resize((width, height), FILTERS[self._resize]))
+        return np.asarray(Image.fromarray(image).resize(pair.size, FILTERS[self._resize]))
 
     def image(self, key: FrameKey) -> ByteArray:
         """(H, W, 3) 8-bit sRGB of the ground truth."""
@@ -279,9 +267,7 @@ class _Column:
         values = self.values(pairs)
         if pooled is None or self.spec.unit != "dB":
             return _mean(values)
-        errors = [10 ** (-value / 10) for value in values]
-        batches = (errors[start : start + pooled] for start in range(0, len(errors), pooled))
-        return _mean([-10 * math.log10(fmean(batch)) for batch in batches])
+        return float(batch_means(np.array(values), pooled, decibels=True).mean()) if values else None
 
     def shown(self, value: float | None) -> str:
         return "–" if value is None else f"{value:.{self.spec.digits}f}"
@@ -327,7 +313,7 @@ def score_pairs(
     if resize is not None:
         notes.append(f"Renders of another size are resized to that of the ground truth ({resize}).")
     if protocol is not None:
-        height, width = images.image(keys[0]).shape[:2]
+        width, height = pairs[0].size
         notes += _protocol_notes(protocols[0], protocol, f"{width}x{height}")
     if lossy := sum(pair.render.suffix.lower() != ".png" for pair in pairs):
         notes.append(f"The compression of {counted(lossy, 'render')} as JPEG or video is scored, too.")

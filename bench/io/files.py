@@ -304,6 +304,11 @@ def entries(folder: Path, pattern: str = "*") -> list[Path]:
     return [path for path in user_files(folder, pattern) if not path.name.startswith(".")]
 
 
+def natural_order(name: str) -> list[str | int]:
+    """Key that sorts names by their numbers: 2 before 10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+
+
 def user_files(folder: Path, pattern: str = "*") -> list[Path]:
     """As `entries`, including hidden files except those of interrupted writes: existing content that a command must
     keep separate."""

@@ -14,6 +14,7 @@ from scipy.interpolate import make_interp_spline
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
+from ...bench.io.files import natural_order
 
 RATES = (24, 25, 30, 48, 50, 60, 100, 120, 240)
 """Usual frames per second, which timecodes count."""
@@ -81,15 +82,10 @@ class Timing:
         return replace(self, positions=self.positions[np.array(rows)])
 
 
-def natural_order(path: Path) -> list[tuple[bool, int | str]]:
-    """Key that sorts names by their numbers: 2 before 10."""
-    return [(part.isdigit(), int(part) if part.isdigit() else part) for part in re.split(r"(\d+)", path.stem)]
-
-
 def in_order(paths: Sequence[Path]) -> tuple[list[Path], Timing]:
     """Files or folders of one frame each by the number of the frame in their names, and their times. The frame's is the
     first number that varies; some or all names may have a second, such as a face's."""
-    paths = sorted(paths, key=natural_order)
+    paths = sorted(paths, key=lambda path: natural_order(path.stem))
     numbers = [[int(part) for part in re.findall(r"\d+", path.stem)] for path in paths]
     varying = [values for values in zip(*numbers) if len({*values}) > 1]
     if not 1 <= len(varying) <= 2:

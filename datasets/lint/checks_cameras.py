@@ -11,12 +11,12 @@ from typing import cast
 import numpy as np
 
 from ...bench.contracts import ByteArray, FloatArray
-from ...bench.progress import counted
+from ...bench.progress import counted, some
 from ..ga import layout
 from ..ga.cameras import ROTATION_TOLERANCE, OutlineView, contradicted_focal, same_intrinsics, weigh_cy
 from ..ga.transforms import FrameEntry
 from .evidence import Evidence, first_entries
-from .rules import Hit, at, rule, some
+from .rules import Hit, at, rule
 
 SAME_PLACE_M = 1e-3
 SAME_TURN = 2e-3

@@ -9,14 +9,14 @@ from itertools import combinations, pairwise
 
 from ...bench.errors import InputError
 from ...bench.io.files import entries
-from ...bench.progress import counted
+from ...bench.progress import counted, some
 from ..ga import layout
 from ..ga.transforms import FrameEntry
 from .capture import Slot
 from .checks_images import unit_range
 from .checks_rig import dead_cameras
 from .evidence import Evidence
-from .rules import Hit, at, rule, some, spans
+from .rules import Hit, at, rule, spans
 from .views import Thumbnail, near_duplicates
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ...bench.progress import counted
+from ...bench.progress import counted, some
 from .checks_rig import blank_cameras, faulty_cameras
 from .evidence import Evidence, first_entries
-from .rules import Hit, rule, some
+from .rules import Hit, rule
 from .views import BACKGROUND_LEVELS, MaskFacts, ViewFacts
 
 MOST = 0.5

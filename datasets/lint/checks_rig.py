@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ...bench.progress import counted
+from ...bench.progress import counted, some
 from .camera_table import FEWEST_CAMERAS, STILL_SHARE, CameraFacts, frozen
 from .evidence import Evidence, first_entries
-from .rules import Hit, at, rule, some
+from .rules import Hit, at, rule
 from .views import BLANK_LEVELS
 
 TELLING_MATCH = 0.4

@@ -11,12 +11,12 @@ import numpy as np
 
 from ...bench.contracts import FloatArray
 from ...bench.errors import InputError
-from ...bench.progress import counted
+from ...bench.progress import counted, some
 from ..ga import layout
 from .checks_cameras import misplaced
 from .checks_rig import faulty_cameras
 from .evidence import Evidence
-from .rules import Hit, rule, some, spans
+from .rules import Hit, rule, spans
 from .views import MeshFacts, ViewFacts
 
 STILL = 1e-4

@@ -7,7 +7,9 @@ import os
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+from ...bench.progress import some
 
 if TYPE_CHECKING:
     from ..ga.transforms import FrameEntry
@@ -104,13 +106,6 @@ def _is_repeated(finding: Finding, findings: Sequence[Finding]) -> bool:
         and (other.file, other.key) == (finding.file, finding.key)
         for other in findings
     )
-
-
-def some(names: Iterable[Any], limit: int = 4) -> str:
-    """The first few names, and the number of others."""
-    names = [str(name) for name in names]
-    rest = len(names) - limit
-    return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def spans(numbers: Iterable[int], limit: int = 4) -> str:

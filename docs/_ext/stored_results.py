@@ -244,7 +244,7 @@ def matrix(docs: Path) -> str:
 
 
 def rows_by_name(page: Path, columns: int) -> dict[str, list[str]]:
-    """Cells after the first one of the rows of tables with so many columns, by the name in code in the first one."""
+    """Cells after the first one of the rows of tables with this number of columns, by the name in code in the first one."""
     rows = (re.split(r" *\| *", line)[1:-1] for line in page.read_text(encoding="utf-8").splitlines())
     return {row[0].strip("`"): row[1:] for row in rows if len(row) == columns and row[0].startswith("`")}
 

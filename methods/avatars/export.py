@@ -28,7 +28,7 @@ from ..shared.rendering import view_of
 from ..shared.tensor_files import read_ply, write_ply
 from ..splats import rasterize
 from .glb import Glb, GlbWriter
-from .harmonics import DEGREE, FIELD_OF_VIEW, direction_of, harmonics_of, orbit_camera
+from .harmonics import DEGREE, FIELD_OF_VIEW, direction_of, extent, harmonics_of, orbit_camera
 from .settings import AvatarOptions, ExportGlbSettings, ExportOptions, ExportPlySettings, ExportSogSettings
 from .web.bake import Source
 
@@ -275,12 +275,12 @@ def export_pose(settings: ExportOptions, name: str, progress: Progress) -> Comma
 def _least_psnr(avatar: SplatAvatar, pose: HeadPose, found: StoredSplats) -> float:
     """Minimum PSNR over `VIEWS`, dB: the file's splats rendered by this package against the avatar's frames, on white."""
     source = Source(avatar, pose, np.zeros(3), np.zeros((4, 3)))
-    extent = np.quantile(source.seen(pose).means, (0.005, 0.995), axis=0)
-    distance = float((extent[1] - extent[0]).max()) / np.tan(np.radians(FIELD_OF_VIEW))
+    low, high = extent(source.seen(pose).means)
+    distance = float((high - low).max()) / np.tan(np.radians(FIELD_OF_VIEW))
     worst = np.inf
     for azimuth, elevation in VIEWS:
         camera = source.camera(
-            orbit_camera(direction_of(azimuth, elevation), 1.5 * distance, extent.mean(axis=0), SIZE)
+            orbit_camera(direction_of(azimuth, elevation), 1.5 * distance, (low + high) / 2, SIZE)
         )
         view = view_of(camera, "cpu", (1.0, 1.0, 1.0))
         colors = harmonic_colors(found.dc, found.rest, found.means - view.center, DEGREE)

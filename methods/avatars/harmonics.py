@@ -21,6 +21,11 @@ SIZE = 128
 """Image size of `visibility`, pixels."""
 
 
+def extent(means: FloatArray) -> FloatArray:
+    """(2, 3) lowest and highest coordinates of (N, 3) splats, without the outermost 1 %."""
+    return np.asarray(np.quantile(means, (0.005, 0.995), axis=0))
+
+
 def contribution(splats: Splats, camera: Camera) -> Tensor:
     """(N,) blending weights of each splat, summed over all pixels of one view, see `pixel_sums`.
 

@@ -38,7 +38,7 @@ from ...datasets.head.arrays import HeadArrays
 from ..shared.tensor_files import read_ply, write_ply
 from ..splats.reference import rotation_matrices
 from .glb import ELEMENT_ARRAY_BUFFER, Glb, GlbWriter
-from .harmonics import camera_at, direction_of
+from .harmonics import camera_at, direction_of, extent
 from .settings import ExportLamSettings
 from .web.bake import AWAY_M, Moved, Source, colors_from, rotation_of, skinning_weights
 from .web.export import NECK, VIEWS, camera_of, open_source, psnr, quaternions, view_around
@@ -204,7 +204,7 @@ def _write_animation(path: Path, avatar: LamAvatar) -> None:
 
 def _bone_nodes(avatar: LamAvatar) -> list[dict[str, Any]]:
     """The bones, the hip where the head is in front of the viewers' camera."""
-    low, high = np.quantile(avatar.means, (0.005, 0.995), axis=0)
+    low, high = extent(avatar.means)
     pitch, half = np.radians(PITCH), np.radians(FIELD_OF_VIEW / 2)
     ahead = np.array([0, np.sin(pitch), -np.cos(pitch)])
     distance = float((high - low).max()) / (2 * FILLED * np.tan(half))

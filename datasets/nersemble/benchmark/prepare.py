@@ -48,6 +48,7 @@ def plan_participant(
         raise InputError("command line", "--test", "at least one sequence to train on", ", ".join(held_out))
     calibration = read_calibration(one.calibration_file)
     jobs: list[SequenceJob] = []
+    shape: FloatArray | None = None  # of the person, that of the first sequence
     for name in names:
         videos = {path.stem.removeprefix("cam_") for path in (one.sequences[name] / "images").glob("*.mp4")}
         serials = [serial for serial in calibration.serials if serial in videos]
@@ -60,10 +61,8 @@ def plan_participant(
                 place = recorded.folder / "alpha_maps" / f"cam_{view.serial}.mp4"
                 raise InputError(place, "", "the alpha maps of the frames", "no such file")
         if track is MONO:
-            shape = (
-                jobs[0].tracked.constant["shape"] if jobs and jobs[0].tracked else None
-            )  # one of the person
             cameras, tracked = _tracked(data, recorded, head, shape)
+            shape = tracked.constant["shape"]
         else:
             cameras, tracked = _untracked(calibration, recorded, head)
         folder = Path(os.path.abspath(out)) / f"{one.subject}_{name}_v{len(serials)}_whiteBg"

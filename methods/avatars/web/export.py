@@ -34,7 +34,7 @@ from ...shared.rendering import view_of
 from ...splats import rasterize
 from ...splats.reference import rotation_matrices
 from ..export import neutral_pose, open_splats
-from ..harmonics import direction_of, orbit_camera
+from ..harmonics import direction_of, extent, orbit_camera
 from ..settings import ExportHtmlSettings, ExportLamSettings
 from .bake import JOINTS, Moved, Slider, Source, WebAvatar, bake
 
@@ -373,7 +373,7 @@ def open_source(settings: ExportHtmlSettings | ExportLamSettings, progress: Prog
 
 def view_around(means: FloatArray) -> dict[str, Any]:
     """The view of `encode` in which (N, 3) splats fill the picture."""
-    low, high = np.quantile(means, (0.005, 0.995), axis=0)
+    low, high = extent(means)
     return {
         "distance": round(DISTANCE_BY_HEIGHT * float((high - low).max()), 4),
         "target": ((low + high) / 2).round(5).tolist(),
