@@ -1,19 +1,25 @@
 """Draws the pictures of the README and of the results page: subjects of a suite that was run here, and stored curves."""
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from PIL import Image
 
-from headbench.bench.protocol import evenly
+from headbench.bench.progress import counted
+from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, evenly
 from headbench.reports.contact_sheet import compared_frame, contact_sheet
-from headbench.reports.curve.curve import HELD_OUT, CurveData, write_curve
+from headbench.reports.curve.curve import HELD_OUT, CurveData, CurvePoint, write_curve
 from headbench.reports.drawing import cost_axis, plot_file, start_axes
 from headbench.reports.runs import SPLIT_TASK, RunData, unseen_cameras
 from headbench.reports.suite.suite import suite_runs
 
 SHOWN = ("ga", "gbs", "ours")
 """Methods beside the ground truth."""
+TASKS = {
+    "novel_view": "Face PSNR (dB), novel views",
+    UNSEEN_CAMERAS: "new expressions, unseen cameras",
+    SEEN_CAMERAS: "new expressions, seen cameras",
+}
+"""Titles of the README's plot by task."""
 
 
 def draw_subjects(suite: Path, path: Path) -> None:
@@ -29,25 +35,27 @@ def draw_subjects(suite: Path, path: Path) -> None:
     Image.open(sheet).convert("RGB").save(path, quality=90)
 
 
-def draw_curves(curve: Callable[[str], CurveData], methods: Sequence[str], folder: Path) -> None:
-    """Draw the curves over seconds and pictures, and the README's plot: PSNR of methods over seconds, with sizes."""
-    for over in ("seconds", "pictures"):
-        write_curve(folder / f"curve-{over}.png", curve(over))
-    data = curve("seconds")
-    lines = {name: [point for point in data.means if point.method == name] for name in methods}
+def draw_curves(curve: CurveData, folder: Path) -> None:
+    """Draw the curves over training time, and the README's plot: PSNR of the face over processor seconds, with sizes."""
+    write_curve(folder / "curves.png", curve)
+    lines: dict[str, list[CurvePoint]] = {}
+    for point in curve.means:
+        lines.setdefault(point.method, []).append(point)
     sizes = [point.values["storage"] for own in lines.values() for point in own]
     note = (
-        f"Means over {len(data.subjects)} subjects, whole frames. Area of a circle: size of the avatar, {min(sizes):.0f} to "
-        f"{max(sizes):.0f} MB. Held out of every training: a camera, and one of {data.every} timesteps."
+        f"Means over {counted(len(curve.subjects), 'development subject')}. Area of a circle: size of the avatar, {min(sizes):.1f} to "
+        f"{max(sizes):.1f} MB."
     )
-    with plot_file(folder / "seconds.png", (8.4, 3.7), 100, methods, note, line="-") as (figure, looks):
-        for axes, task in zip(figure.subplots(1, len(data.tasks), sharey=True), data.tasks):
-            start_axes(axes, f"PSNR (dB), held-out {HELD_OUT[task]}")
+    with plot_file(folder / "seconds.png", (8.4, 3.7), 100, lines, note, line="-") as (figure, looks):
+        for axes, (task, title) in zip(figure.subplots(1, len(TASKS), sharey=True), TASKS.items()):
+            start_axes(axes, title)
             for name, own in lines.items():
-                place = [[p.cost[data.clock] for p in own], [p.values[f"psnr_{HELD_OUT[task]}"] for p in own]]
+                place = [
+                    [p.cost[curve.clock] for p in own],
+                    [p.values[f"psnr_face_{HELD_OUT[task]}"] for p in own],
+                ]
                 areas, colour = [8 * point.values["storage"] for point in own], looks[name][0]
                 axes.plot(*place, color=colour, linewidth=1.2)
                 axes.scatter(*place, areas, color=colour, alpha=0.75, edgecolors="white", zorder=3)
-            axes.set(xlabel=data.axis)
+            axes.set(xlabel=curve.axis)
             cost_axis(axes)
-        axes.set_ylim(bottom=14)  # the shortest training of `gha` is below

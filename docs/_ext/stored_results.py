@@ -2,8 +2,8 @@
 
 python docs/_ext/stored_results.py WHAT OUT .
 
-WHAT is demo, suite, profiles, faces or frames (a run of one subject), further or mechanisms (a folder of runs) or curves (a folder of
-seconds and pictures); OUT is the folder of the run or runs. A block of a page is between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``.
+WHAT is demo, suite, profiles, faces or frames (a run of one subject), or further, mechanisms, curves or sizes (a folder of runs); OUT
+is the folder of the run or runs. A block of a page is between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``.
 """
 
 import os
@@ -16,19 +16,20 @@ from functools import cache
 from itertools import groupby, product
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import readme_pictures
 
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
-from headbench.bench.experiments.extremes import RECORD_FILE
+from headbench.bench.experiments.specs import MOVED_LINES, RECORD_FILE, RECORDED_RUN, RUN
 from headbench.bench.io.files import write_json, write_text
 from headbench.bench.progress import counted
-from headbench.bench.protocol import UNSEEN_CAMERAS
+from headbench.bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
 from headbench.bench.registry import discover, get
 from headbench.bench.rows import FULL, Rows
 from headbench.reports.aggregate import coded_labels, summarise
-from headbench.reports.curve.curve import HELD_OUT, CurveData, leaders_text, read_curve
+from headbench.reports.curve.curve import HELD_OUT, CurveData, CurvePoint, held_out, leaders_text, read_curve
 from headbench.reports.papers import papers
 from headbench.reports.protocols import choice_effects
 from headbench.reports.runs import FrameSelection, RunData, RunSet
@@ -36,6 +37,8 @@ from headbench.reports.suite.suite import (
     FOLDER,
     comparison,
     differences,
+    planned_subjects,
+    primary_table,
     read_extremes,
     suite_report,
     suite_runs,
@@ -46,13 +49,16 @@ from headbench.reports.writers import pipe_table, to_markdown, to_text
 
 NOVEL, FACE, DOCS = "novel_view", "face", "docs/explanation"
 OURS, REFERENCE = "ours", "ga"
-BESIDE = (OURS, "ours+equal-iterations", "ours-plus", "gbs", "gbs+as-tracked")
+MOVED = f"{OURS}+{MOVED_LINES}"
+BESIDE = (OURS, MOVED, "ours-plus", "gbs")
 """Methods of the results page's differences from `REFERENCE`."""
+CURVED = (REFERENCE, "gbs", OURS, "ours-plus")
+"""Methods with a curve on every development subject."""
 COLUMNS = (
     ("Face PSNR, novel views (dB) ↑", FACE, "psnr", NOVEL, 1),
     ("Face PSNR, new expressions (dB) ↑", FACE, "psnr", UNSEEN_CAMERAS, 1),
+    ("Face LPIPS ↓", FULL, "lpips-face", NOVEL, 3),
     ("PSNR (dB) ↑", FULL, "psnr", NOVEL, 1),
-    ("SSIM ↑", FULL, "ssim", NOVEL, 3),
     ("LPIPS ↓", FULL, "lpips", NOVEL, 3),
     ("MB ↓", FULL, "storage", "", 1),
     ("ms a frame ↓", FULL, "latency_p50", "", 0),
@@ -61,68 +67,73 @@ COLUMNS = (
 """Of the README's table: title, region, metric, task, digits."""
 
 
-def read_stored(folder: Path) -> RunData:
-    """A run without coded avatars: those stored were written with a codec that headbench no longer has."""
-    run = RunData.read(folder)
-    coded, methods = coded_labels(run.manifest).values(), run.manifest.methods
-    kept = tuple(record for record in methods if record.label not in coded)
-    manifest = replace(run.manifest, methods=kept)
-    return replace(run, manifest=manifest, rows=run.rows.of_methods([record.label for record in kept]))
-
-
 class StoredResults:
     """The stored runs of a repository, each read once, and what pages show of them, as Markdown."""
 
     def __init__(self, root: Path):
         self.root, self.gallery = root, root / "reports" / "gallery"
-        self.run = cache(read_stored)
+        self.run = cache(RunData.read)
         self.read = cache(lambda *folders: RunSet.joined(tuple(map(self.run, folders))))
-        self.curve = cache(lambda over: read_curve([*map(self.run, self.runs("curves", over))], over))
+        self.curve = cache(
+            lambda *methods: read_curve([*map(self.run, self.inside("curves"))], "budget", methods)
+        )
 
     def runs(self, *place: str) -> list[Path]:
         """Folders of the stored runs of one kind."""
         return suite_runs(self.gallery.joinpath(*place[:-1]), place[-1])
 
+    def inside(self, name: str) -> list[Path]:
+        """Folders of all stored runs in a folder of the gallery, at any depth."""
+        return sorted(file.parent for file in (self.gallery / name).rglob("run.json"))
+
     @property
     def suite(self) -> RunSet:
-        """The runs of the suite."""
-        return self.read(*self.runs("suite", "run"))
+        """The runs of the suite on exact captures."""
+        return self.read(*self.runs("suite", RUN))
+
+    @property
+    def recorded(self) -> RunSet:
+        """The runs of the suite on captures as recordings are."""
+        return self.read(*self.runs("suite", RECORDED_RUN))
 
     def blocks(self) -> dict[tuple[str, str], str]:
         """Every block by its page and name."""
         demo, profiles, faces = (self.read(self.gallery / name) for name in ("", "profiles", "faces"))
         folders = self.runs("further")
-        same = self.read(*folders, *(self.gallery / "suite" / "run" / run.name for run in folders))
+        same = self.read(*folders, *(self.gallery / "suite" / RUN / run.name for run in folders))
         further, new = same.only(same.ranked).shared.by_camera, self.run(folders[0]).methods
         beside = f"{main_table(further)}\n\n{psnr_differences(further, new, REFERENCE)}"
-        columns = Columns(digits=("psnr=1", "ssim=3", "lpips=3"))
-        printed = to_text(table_of(demo, columns=replace(columns, names=(NOVEL, "psnr", "ssim", "lpips"))))
-        lines = [f"{OURS}+{name}" for name in get("methods", OURS).ablations]
+        columns = Columns((NOVEL, "psnr", "ssim", "lpips"), digits=("psnr=1", "ssim=3", "lpips=3"))
+        printed = to_text(table_of(demo, columns=columns))
         return {
             ("README.md", "demo"): "```text\n{}\n```".format(
                 next(part for part in printed.split("\n\n") if "\nMethod" in part)
             ),
             ("README.md", "suite"): main_table(self.ranked),
-            ("README.md", "findings"): findings(self.suite, self.curve("seconds")),
-            (f"{DOCS}/results.md", "demo"): to_markdown(table_of(demo, columns=columns)).strip(),
-            (f"{DOCS}/results.md", "differences"): psnr_differences(self.suite, BESIDE, REFERENCE),
-            (f"{DOCS}/results.md", "curves-seconds"): curve_table(self.curve("seconds"), 1),
-            (f"{DOCS}/results.md", "curves-pictures"): curve_table(self.curve("pictures"), 2),
-            (f"{DOCS}/protocols.md", "protocols"): choices(self.suite),
-            (f"{DOCS}/protocols.md", "profiles"): choices(profiles),
+            ("README.md", "findings"): findings(self.recorded, self.curve(*CURVED)),
+            (f"{DOCS}/results.md", "endpoints"): primary_table(self.recorded, self.suite),
+            (f"{DOCS}/results.md", "differences"): psnr_differences(self.recorded, BESIDE, REFERENCE),
+            (f"{DOCS}/results.md", "exact"): psnr_differences(self.suite, BESIDE, REFERENCE, (FACE,)),
+            (f"{DOCS}/results.md", "table-4"): moved_lines(self.recorded, self.suite),
+            (f"{DOCS}/results.md", "curves"): curve_table(self.curve(*CURVED), self.curve(OURS, REFERENCE)),
+            (f"{DOCS}/results.md", "sizes"): sizes(
+                {run.name: self.read(run) for run in self.inside("sizes")}
+            ),
+            (f"{DOCS}/results.md", "extremes"): extremes(read_extremes(self.runs("suite", RUN))),
+            (f"{DOCS}/protocols.md", "protocols"): choices(self.recorded),
+            (f"{DOCS}/protocols.md", "profiles"): choices(profiles, "the third suite"),
             (f"{DOCS}/metrics.md", "faces"): to_markdown(table_of(faces)).strip(),
             (f"{DOCS}/metrics.md", "mechanisms"): mechanisms(
                 {folder.name: self.read(folder) for folder in self.runs("mechanisms")}
             ),
             (f"{DOCS}/methods/index.md", "matrix"): matrix(self.root / "docs"),
-            (f"{DOCS}/methods/ours.md", "ablations"): psnr_differences(self.suite, lines, OURS),
             (f"{DOCS}/methods/rgbavatar.md", "further"): beside,
         }
 
     @property
     def ranked(self) -> RunSet:
-        """The suite's methods, without baselines and conditions, with self-reenactment by camera."""
-        return self.suite.only(self.suite.ranked).shared.by_camera
+        """The suite's methods on captures as recordings are, without baselines and conditions, with self-reenactment by camera."""
+        return self.recorded.only(self.recorded.ranked).shared.by_camera
 
     def write(self) -> None:
         """Write every block into its page, and all tables and means of the suite into their files."""
@@ -166,26 +177,64 @@ def main_table(runs: RunSet) -> str:
 
 
 def findings(suite: RunSet, curve: CurveData) -> str:
-    """Three sentences on the suite's results."""
+    """Sentences on the endpoints, the crossing of Table 4, and the training time."""
     trainings = [summarise(suite.rows, name, "training_processor", "").value for name in suite.ranked]
-    behind = comparison(suite, (REFERENCE, OURS), NOVEL, "psnr", FACE)
-    without = comparison(suite, (f"{OURS}+no-lines", OURS), NOVEL, "psnr", FACE)
-    values = {(point.method, point.budget.seconds): point.values["psnr_timesteps"] for point in curve.means}
-    early, late = (values[REFERENCE, limit] - values[OURS, limit] for limit in (30, 120))
-    assert min(behind.low, early, late) > 0 > without.low, "the sentences do not fit these rows"
+    pair, moved = (OURS, REFERENCE), (MOVED, OURS)
+    novel, new = (comparison(suite, pair, task, "psnr", FACE) for task in (NOVEL, UNSEEN_CAMERAS))
+    novel_moved, new_moved = (
+        comparison(suite, moved, task, "psnr", FACE) for task in (NOVEL, UNSEEN_CAMERAS)
+    )
+    planned = planned_subjects(suite)
+    interim = f"; interim, {planned} are planned" if novel.subjects < planned else ""
+    first = {}
+    for task in (NOVEL, SEEN_CAMERAS):
+        led = [f"`{each.method}` from {each.start:.0f} s" for each in curve.best[f"psnr_{FACE}", task]]
+        first[task] = ", ".join(led)
     return f"""\
-- In the face at the unseen camera `{OURS}` is {behind.difference:.1f} dB behind `{REFERENCE}` (95 % interval {behind.low:.1f} to \
-{behind.high:.1f} dB, {behind.subjects} subjects), with about {fmean(trainings):.0f} processor seconds of training.
-- The feature lines of `{OURS}`, the main idea of its paper, are off in these runs: without them the face changes by \
-{without.difference:+.2f} dB ({without.low:+.2f} to {without.high:+.2f}, {without.subjects} subjects). Since version 5 they \
-[act](docs/explanation/methods/ours.md#feature-lines).
-- The differences depend on the training time: on held-out timesteps `{OURS}` is {early:.1f} dB behind `{REFERENCE}` after 30 s, and \
-{late:.1f} dB after 120 s ({len(curve.subjects)} subjects, whole frames)."""
+- In the face at cameras without training images, `{OURS}` minus `{REFERENCE}` is {novel.text(1)} dB in novel views and {new.text(1)} dB \
+in new expressions (means over subjects with 95 % intervals{interim}), with about {fmean(trainings):.0f} processor seconds of training.
+- Lines that move splats (`{MOVED}`) instead of changing their opacity change novel views by {novel_moved.text(1)} dB and new \
+expressions by {new_moved.text(1)} dB in the face; in Table 4 of the paper of `{OURS}` by +1.2 and -0.7 dB.
+- The best method depends on the training time. By PSNR in the face, in novel views: {first[NOVEL]}; in new expressions at cameras of \
+training: {first[SEEN_CAMERAS]} (processor seconds, {counted(len(curve.subjects), "development subject")}, up to {longest(curve):.0f} s)."""
 
 
-def psnr_differences(runs: RunSet, methods: Sequence[str], reference: str) -> str:
+def longest(curve: CurveData) -> float:
+    """Processor seconds of the longest training of a curve, mean over subjects."""
+    return max(point.cost[curve.clock] or 0.0 for point in curve.means)
+
+
+def moved_lines(recorded: RunSet, exact: RunSet) -> str:
+    """Lines that move splats minus lines that change their opacity, PSNR by task, beside the values of the paper's Table 4."""
+    tasks = (NOVEL, SEEN_CAMERAS, UNSEEN_CAMERAS)
+    (table,) = [each for each in papers()["tensorial-2025"].tables if each.table == "Table 4"]
+    opacity, moved = ({key: float(value) for key, value in row.values.items()} for row in table.rows)
+    printed = {key.split("/")[0]: moved[key] - opacity[key] for key in moved if key.endswith("/psnr")}
+    lines = [
+        ["PSNR, dB", *(TASK_TITLES[task] for task in tasks), "novel view minus unseen cameras", "subjects"]
+    ]
+    lines.append(["---", *["--:"] * (2 + len(tasks))])
+    both = printed[NOVEL], printed["self_reenactment"]
+    lines.append(
+        ["paper, whole frame", f"{both[0]:+.2f}", f"{both[1]:+.2f}", "–", f"{both[0] - both[1]:+.2f}*", "1"]
+    )
+    for title, runs, region in (
+        ("as recordings are, face", recorded, FACE),
+        ("as recordings are, whole frame", recorded, FULL),
+        ("exact, face", exact, FACE),
+        ("exact, whole frame", exact, FULL),
+    ):
+        found = [comparison(runs, (MOVED, OURS), task, "psnr", region) for task in tasks]
+        found.append(comparison(runs, (MOVED, OURS), NOVEL, "psnr", region, minus=UNSEEN_CAMERAS))
+        lines.append([title, *(each.text(2) for each in found), str(found[0].subjects)])
+    return f"{pipe_table(lines)}\n\n\\* All cameras, of which one has no training images."
+
+
+def psnr_differences(
+    runs: RunSet, methods: Sequence[str], reference: str, regions: Sequence[str] = (FULL, FACE)
+) -> str:
     """Differences of the methods that the runs have from another, in whole frames and in the face."""
-    columns = [(task, "psnr", region) for task, region in product(runs.by_camera.tasks, (FULL, FACE))]
+    columns = [(task, "psnr", region) for task, region in product(runs.by_camera.tasks, regions)]
     known = [name for name in methods if name in runs.methods]
     return differences(runs, known, reference, columns, f"PSNR minus that of `{reference}`, dB")
 
@@ -268,26 +317,90 @@ OF_THE_PAPER = ("", "ours", "baseline", "full")
 """Names of rows that are a paper's own method."""
 
 
-def choices(runs: RunSet) -> str:
+def choices(runs: RunSet, suite: str = "the suite") -> str:
     """Effects of evaluation choices on two methods."""
     subjects = counted(len(runs.rows.subjects), "subject")
-    return f"`{OURS}` and `{REFERENCE}`, {subjects} of the suite:\n\n{choice_effects(runs.only([OURS, REFERENCE]))[0]}"
+    return f"`{OURS}` and `{REFERENCE}`, {subjects} of {suite}:\n\n{choice_effects(runs.only([OURS, REFERENCE]))[0]}"
 
 
-def curve_table(curve: CurveData, place: int) -> str:
-    """PSNR of both kinds of held-out frames by method and quantity, size of the largest avatar, and the best methods."""
-    kinds = [HELD_OUT[task] for task in curve.tasks]
-    amounts = sorted({point.place[place] for point in curve.means})
-    lines = [[curve.over, *(f"{each:g}" for each in amounts), "MB"], ["---"] * (2 + len(amounts))]
+def curve_table(curve: CurveData, pair: CurveData) -> str:
+    """PSNR of the face and processor seconds by method and length of training, and the best methods, of all and of a pair."""
+    parts = sorted({point.part for point in curve.means})
+    lines = [["Method", *(f"{part} of the budget" for part in parts)], ["---", *["---"] * len(parts)]]
     for method, points in groupby(curve.means, key=lambda point: point.method):
-        values = {point.place[place]: point.values for point in points}
-        cells = {n: " / ".join(f"{own[f'psnr_{kind}']:.2f}" for kind in kinds) for n, own in values.items()}
-        shown = [cells.get(n, "–") for n in amounts]
-        lines.append([f"`{method}`", *shown, f"{max(own['storage'] for own in values.values()):.1f}"])
-    head = (
-        f"PSNR in dB, held-out {' / '.join(kinds)}, means over subjects {', '.join(sorted(curve.subjects))}:"
-    )
-    return f"{head}\n\n{pipe_table(lines)}\n\n{leaders_text(curve)}"
+        cells = {point.part: curve_cell(point, curve) for point in points}
+        lines.append([f"`{method}`", *(cells.get(part, "ended") for part in parts)])
+    kinds = " / ".join(held_out(task) for task in curve.tasks)
+    head = f"PSNR of the face in dB, held-out {kinds}, after processor seconds; means over {counted(len(curve.subjects), 'subject')}:"
+    of_face = [spec for spec in curve.metrics if spec.name == f"psnr_{FACE}"]
+    led = [leaders_text(replace(each, metrics=of_face)) for each in (curve, pair)]
+    names = " and ".join(f"`{name}`" for name in dict.fromkeys(point.method for point in pair.means))
+    return "\n\n".join([head, pipe_table(lines), led[0], f"Of {names} alone:", led[1].partition("\n\n")[2]])
+
+
+def curve_cell(point: CurvePoint, curve: CurveData) -> str:
+    """Values of a training by task, and its seconds."""
+    values = " / ".join(f"{point.values[f'psnr_{FACE}_{HELD_OUT[task]}']:.1f}" for task in curve.tasks)
+    return f"{values} ({point.cost[curve.clock]:.0f} s)"
+
+
+def sizes(runs: Mapping[str, RunSet]) -> str:
+    """PSNR of the face, bytes of trained and coded avatars, and ms a frame, by maximum number of splats."""
+    heads = ["Splats", "Method", *(f"{TASK_TITLES[task]}, face (dB)" for task in (NOVEL, UNSEEN_CAMERAS))]
+    heads += ["coded: novel view, face (dB)", "MB", "coded MB", "ms a frame"]
+    lines = [heads, ["---", "---", *["--:"] * (len(heads) - 2)]]
+    for splats, read in sorted(runs.items(), key=lambda item: float(item[0])):
+        each = read.by_camera
+        face, coded = each.of(FrameSelection(FACE)).rows, coded_labels(each.runs[0].manifest)
+        for name in each.ranked:
+            small = coded[name]
+            values = [
+                *(summarise(face, name, "psnr", task) for task in (NOVEL, UNSEEN_CAMERAS)),
+                summarise(face, small, "psnr", NOVEL),
+                *(summarise(each.rows, label, "storage", "") for label in (name, small)),
+                summarise(each.rows, name, "latency_p50", ""),
+            ]
+            digits = (1, 1, 1, 2, 2, 0)
+            cells = [f"{v.value:.{n}f}" for v, n in zip(values, digits, strict=True)]
+            lines.append([f"{splats},000", f"`{name}`", *cells])
+    return pipe_table(lines)
+
+
+def extremes(avatars: Sequence[Mapping[str, Any]]) -> str:
+    """Failures of avatars in new poses and views by method: a table and a sentence."""
+    by_method: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
+    for avatar in avatars:
+        by_method[avatar["method"]].append(avatar)
+    heads = [
+        "Method",
+        "subjects",
+        "frames",
+        "non-finite values",
+        "face PSNR (dB)",
+        "worst",
+        "flicker",
+        "frames over a limit",
+    ]
+    lines = [heads, ["---", *["--:"] * (len(heads) - 1)]]
+    finite = True
+    for method, own in by_method.items():
+        measures = [avatar["measures"] for avatar in own]
+        faces = [each["psnr face"] for each in measures if each["psnr face"]["mean"] is not None]
+        steady = [each["flicker"]["mean"] for each in measures if each["flicker"]["mean"] is not None]
+        broken = sum(each["non_finite"]["failed"] for each in measures)
+        finite = finite and not broken
+        face = ["–", "–"]
+        if faces:
+            face = [
+                f"{fmean(each['mean'] for each in faces):.1f}",
+                f"{min(each['worst'] for each in faces):.1f}",
+            ]
+        flicker = f"{fmean(steady):.2f}" if steady else "–"
+        counts = [len(own), sum(avatar["frames"] for avatar in own), broken]
+        over = sum(avatar["frames_broken"] for avatar in own)
+        lines.append([f"`{method}`", *map(str, counts), *face, flicker, str(over)])
+    said = "No avatar renders non-finite values." if finite else "Some avatars render non-finite values."
+    return f"{said}\n\n{pipe_table(lines)}"
 
 
 def block_of(page: Path, name: str) -> str:
@@ -319,7 +432,7 @@ def main(what: str, out: Path, root: Path) -> None:
         store(found.parent, stored.gallery / place / found.parent.relative_to(out))
     stored.write()
     if what == "curves":
-        readme_pictures.draw_curves(stored.curve, stored.ranked.methods, root / "docs" / "pictures")
+        readme_pictures.draw_curves(stored.curve(), root / "docs" / "pictures")
     if what == "suite":
         readme_pictures.draw_subjects(out, stored.gallery / "subjects.jpg")
 

@@ -202,66 +202,60 @@ class Leader:
     """A method that has the best mean from a certain cost on.
 
     ``interval`` are the costs around ``start`` at which the 95 % interval of the paired difference to the previous leader
-    contains 0; an end beyond the measured costs is None. None instead of a pair for the first leader, for a method that is best
-    from its lowest cost on without a crossing, and with too few subjects.
+    contains 0; an end beyond the compared costs is None. None instead of a pair for the first leader, and with too few subjects.
     """
 
     method: str
-    start: float  # where its curve crosses that of the previous leader, or its lowest cost
+    start: float  # where its curve crosses that of the previous leader, or the lowest compared cost
     interval: tuple[float | None, float | None] | None
-    measured: tuple[float, float]  # lowest and highest cost at which it and the previous leader have values
+    compared: tuple[float, float]  # lowest and highest compared cost
 
     def text(self) -> str:
         """Method, cost and interval, such as "`ga` from 11 [8.2, above 120]"."""
         if self.interval is None:
             return f"`{self.method}` from {self.start:.3g}"
         low, high = (f"{end:.3g}" if end is not None else "" for end in self.interval)
-        ends = f"{low or f'below {self.measured[0]:.3g}'}, {high or f'above {self.measured[1]:.3g}'}"
+        ends = f"{low or f'below {self.compared[0]:.3g}'}, {high or f'above {self.compared[1]:.3g}'}"
         return f"`{self.method}` from {self.start:.3g} [{ends}]"
 
 
 def leaders(lines: Lines, *, higher_is_better: bool) -> list[Leader]:
     """The methods with the best mean, by increasing cost, over the subjects that all methods have.
 
-    Quality is interpolated linearly between measured trainings, over the logarithm of the cost if all costs are above 0. A
-    method is included from its lowest cost on. Beyond its highest cost it keeps the quality there, since that training also
-    fits larger budgets.
+    Quality is interpolated linearly between measured trainings, over the logarithm of the cost if all costs are above 0. Methods are
+    compared from the lowest cost on at which all have a training. Beyond its highest cost a method keeps the quality there, since
+    that training also fits larger budgets.
     """
     subjects = sorted(set.intersection(*(set(own) for own in lines.values()))) if lines else []
     if not subjects:
         return []
-    costs = [cost for own in lines.values() for subject in subjects for cost, _ in own[subject]]
-    spaced = np.geomspace if min(costs) > 0 else np.linspace
-    grid = spaced(min(costs), max(costs), GRID)
+    pairs = {
+        name: [np.array(sorted(line[subject])).T for subject in subjects] for name, line in lines.items()
+    }
+    first, last = ([float(cost[end]) for own in pairs.values() for cost, _ in own] for end in (0, -1))
+    lowest, highest = max(first), max(last)
+    scale, spaced = (np.log, np.geomspace) if min(first) > 0 else (np.positive, np.linspace)
+    grid = spaced(lowest, highest, GRID)
     sign = 1.0 if higher_is_better else -1.0
-    scale = np.log if grid[0] > 0 else np.positive
-    values = {}  # by method, (S, G) qualities of the subjects at the costs of the grid; NaN below their lowest cost
-    for name, line in lines.items():
-        pairs = [np.array(sorted(line[subject])).T for subject in subjects]
-        curves = [np.interp(scale(grid), scale(cost), value, left=np.nan) for cost, value in pairs]
-        values[name] = sign * np.stack(curves)
-    means = np.stack([curves.mean(0) for curves in values.values()])
+    values = {}  # by method, (S, G) qualities of the subjects at the costs of the grid
+    for name, own in pairs.items():
+        values[name] = sign * np.stack(
+            [np.interp(scale(grid), scale(cost), quality) for cost, quality in own]
+        )
     names = list(values)
-    best = np.where(np.isnan(means), -np.inf, means).argmax(0)
-    measured = np.isfinite(means).any(0)
+    best = np.stack([curves.mean(0) for curves in values.values()]).argmax(0)
     leading: list[Leader] = []
-    for place in range(GRID):
-        name = names[best[place]]
-        if not measured[place] or (leading and leading[-1].method == name):
+    for place, name in enumerate(names[number] for number in best):
+        if leading and leading[-1].method == name:
             continue
-        compared = [lines[name], *(lines[leader.method] for leader in leading[-1:])]
-        lowest = max(min(line[subject])[0] for line in compared for subject in subjects)
-        around = None
-        if leading and np.isfinite(values[name][:, place - 1]).all():
-            around = _around(values[name] - values[leading[-1].method], place, grid)
-        leading.append(Leader(name, float(grid[place]), around, (lowest, max(costs))))
+        around = _around(values[name] - values[leading[-1].method], place, grid) if leading else None
+        leading.append(Leader(name, float(grid[place]), around, (lowest, highest)))
     return leading
 
 
 def _around(change: FloatArray, place: int, grid: FloatArray) -> tuple[float | None, float | None] | None:
     """Costs between which the interval of the mean ``change``, (S, G), contains 0, around a place of the grid."""
-    # A method has no value below its lowest cost, and so no interval there.
-    bounds = [interval(changes.tolist()) if np.isfinite(changes).all() else None for changes in change.T]
+    bounds = [interval(changes.tolist()) for changes in change.T]
     if bounds[place] is None:
         return None
     different = [ends is not None and (ends[0] > 0 or ends[1] < 0) for ends in bounds]
