@@ -29,7 +29,7 @@ from headbench.bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
 from headbench.bench.registry import discover, get
 from headbench.bench.rows import FULL, Rows
 from headbench.reports.aggregate import coded_labels, summarise
-from headbench.reports.curve.curve import HELD_OUT, CurveData, CurvePoint, held_out, leaders_text, read_curve
+from headbench.reports.curve.curve import HELD_OUT, CurveData, CurvePoint, leaders_text, read_curve
 from headbench.reports.papers import papers
 from headbench.reports.protocols import choice_effects
 from headbench.reports.runs import FrameSelection, RunData, RunSet
@@ -186,22 +186,30 @@ def findings(suite: RunSet, curve: CurveData) -> str:
     )
     planned = planned_subjects(suite)
     interim = f"; interim, {planned} are planned" if novel.subjects < planned else ""
-    first = {}
-    for task in (NOVEL, SEEN_CAMERAS):
-        led = [f"`{each.method}` from {each.start:.0f} s" for each in curve.best[f"psnr_{FACE}", task]]
-        first[task] = ", ".join(led)
+    longest = max(point.cost[curve.clock] or 0.0 for point in curve.means)
+    after = {
+        seconds: " and ".join(f"`{best_at(curve, task, seconds)}` in {what}" for task, what in SPOKEN.items())
+        for seconds in (60.0, longest)
+    }
     return f"""\
 - In the face at cameras without training images, `{OURS}` minus `{REFERENCE}` is {novel.text(1)} dB in novel views and {new.text(1)} dB \
 in new expressions (means over subjects with 95 % intervals{interim}), with about {fmean(trainings):.0f} processor seconds of training.
 - Lines that move splats (`{MOVED}`) instead of changing their opacity change novel views by {novel_moved.text(1)} dB and new \
 expressions by {new_moved.text(1)} dB in the face; in Table 4 of the paper of `{OURS}` by +1.2 and -0.7 dB.
-- The best method depends on the training time. By PSNR in the face, in novel views: {first[NOVEL]}; in new expressions at cameras of \
-training: {first[SEEN_CAMERAS]} (processor seconds, {counted(len(curve.subjects), "development subject")}, up to {longest(curve):.0f} s)."""
+- With one minute of training on one processor the face is best of {after[60.0]}, with {longest / 60:.0f} minutes of {after[longest]} \
+({counted(len(curve.subjects), "development subject")}, at most 20,000 splats; longer trainings are not measured)."""
 
 
-def longest(curve: CurveData) -> float:
-    """Processor seconds of the longest training of a curve, mean over subjects."""
-    return max(point.cost[curve.clock] or 0.0 for point in curve.means)
+SPOKEN = {
+    NOVEL: "novel views",
+    UNSEEN_CAMERAS: "new expressions at cameras without training images",
+    SEEN_CAMERAS: "new expressions at cameras with them",
+}
+
+
+def best_at(curve: CurveData, task: str, seconds: float) -> str:
+    """The method with the best mean PSNR of the face at a number of processor seconds."""
+    return [each.method for each in curve.best[f"psnr_{FACE}", task] if each.start <= seconds][-1]
 
 
 def moved_lines(recorded: RunSet, exact: RunSet) -> str:
@@ -326,12 +334,12 @@ def choices(runs: RunSet, suite: str = "the suite") -> str:
 def curve_table(curve: CurveData, pair: CurveData) -> str:
     """PSNR of the face and processor seconds by method and length of training, and the best methods, of all and of a pair."""
     parts = sorted({point.part for point in curve.means})
-    lines = [["Method", *(f"{part} of the budget" for part in parts)], ["---", *["---"] * len(parts)]]
+    lines = [["Method", *(f"{part} of the longest" for part in parts)], ["---", *["---"] * len(parts)]]
     for method, points in groupby(curve.means, key=lambda point: point.method):
         cells = {point.part: curve_cell(point, curve) for point in points}
         lines.append([f"`{method}`", *(cells.get(part, "ended") for part in parts)])
-    kinds = " / ".join(held_out(task) for task in curve.tasks)
-    head = f"PSNR of the face in dB, held-out {kinds}, after processor seconds; means over {counted(len(curve.subjects), 'subject')}:"
+    kinds = " / ".join(TASK_TITLES[task].lower() for task in curve.tasks)
+    head = f"PSNR of the face in dB, {kinds}, and processor seconds of the training; means over {counted(len(curve.subjects), 'subject')}:"
     of_face = [spec for spec in curve.metrics if spec.name == f"psnr_{FACE}"]
     led = [leaders_text(replace(each, metrics=of_face)) for each in (curve, pair)]
     names = " and ".join(f"`{name}`" for name in dict.fromkeys(point.method for point in pair.means))
