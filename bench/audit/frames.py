@@ -19,7 +19,7 @@ from ..engine.store import Cell, RunFolder
 from ..errors import InputError
 from ..io.documents import read_text
 from ..io.files import check_output_folder, reading, with_slashes, write_text
-from ..io.images import read_pixels, read_png
+from ..io.images import read_pixels, read_png, write_png
 from ..protocol import make_protocols
 from ..registry import discover, get, resolve, unknown
 from ..specs import CommandResult, DatasetSpec, command
@@ -189,6 +189,9 @@ class FramesSettings(RunOptions):
     reader: str = ""
     """Which dataset reader opens the capture; default: the one that finds it."""
 
+    images: bool = False
+    """Also write the true images as PNG under their file names, for `headbench evaluate --truth`."""
+
 
 FRAMES_FILE, MAP_FILE = "frames.csv", "MAP.csv"
 POSE_COLUMNS = (
@@ -221,6 +224,9 @@ def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> 
         raise InputError(out / MAP_FILE, "", expected, "another list", "Move it, or choose another --out.")
     write_text(out / FRAMES_FILE, csv_text(frames))
     write_text(out / MAP_FILE, listing)
+    for done, (name, *key) in enumerate(names[1:] if settings.images else (), 1):
+        write_png(out / str(name), by_subject[key[0]].image(FrameKey(*key)))
+        progress(done, len(names) - 1, "images")
     counts = {task: len(protocol.keys) for task, protocol in protocols.items()}
     hashes = {task: protocol.hash for task, protocol in protocols.items()}
     shown = ", ".join(f"{count} of {task} (protocol {hashes[task]})" for task, count in counts.items())
