@@ -210,23 +210,24 @@ def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> 
     by_subject = {clip.subject: clip for clip in clips}
     pose_files = _pose_files(config, clips)
     frames: list[Sequence[object]] = [POSE_COLUMNS]
-    names: list[Sequence[object]] = [MAP_COLUMNS]
+    named: list[tuple[str, FrameKey]] = []
     for task, protocol in protocols.items():
         for key in protocol.keys:
             name = image_name(task, key).as_posix()
             pose_file = pose_files.get((key.subject, key.timestep), "")
             frames.append((task, *key, name, *_camera(by_subject[key.subject], key), pose_file))
-            names.append((name, *key))
-    out, listing = Path(settings.out), csv_text(names)
+            named.append((name, key))
+    out = Path(settings.out)
+    listing = csv_text([MAP_COLUMNS, *((name, *key) for name, key in named)])
     check_output_folder(out)
     if (out / MAP_FILE).exists() and (out / MAP_FILE).read_text(encoding="utf-8") != listing:
         expected = "no such file, or the template of the same frames"
         raise InputError(out / MAP_FILE, "", expected, "another list", "Move it, or choose another --out.")
     write_text(out / FRAMES_FILE, csv_text(frames))
     write_text(out / MAP_FILE, listing)
-    for done, (name, *key) in enumerate(names[1:] if settings.images else (), 1):
-        write_png(out / str(name), by_subject[key[0]].image(FrameKey(*key)))
-        progress(done, len(names) - 1, "images")
+    for done, (name, key) in enumerate(named if settings.images else (), 1):
+        write_png(out / name, by_subject[key.subject].image(key))
+        progress(done, len(named), "images")
     counts = {task: len(protocol.keys) for task, protocol in protocols.items()}
     hashes = {task: protocol.hash for task, protocol in protocols.items()}
     shown = ", ".join(f"{count} of {task} (protocol {hashes[task]})" for task, count in counts.items())
