@@ -15,7 +15,7 @@ class ExitCode(IntEnum):
     """The command finished with a negative result: a method failed, a number got worse, a check did not
     pass."""
     BAD_INPUT = 2
-    """Wrong usage, bad input, or a file or folder that cannot be read or written."""
+    """Wrong usage, bad input, a missing package or program, or a file or folder that cannot be read or written."""
     NO_VERDICT = 3
     """Data that the verdict needs is missing or invalid."""
     UNEXPECTED = 70
@@ -27,7 +27,7 @@ class ExitCode(IntEnum):
 
 EXIT_CODES = (
     "Exit codes: 0 done; 1 done, but a method failed, a number got worse or a check did not pass; "
-    "2 wrong usage, bad input, or a file that cannot be read or written; 3 data needed for a verdict is missing or invalid; "
+    "2 wrong usage, bad input, a missing package or program, or a file that cannot be read or written; 3 data needed for a verdict is missing or invalid; "
     "70 unexpected error, please report; 129, 130, 143 ended by SIGHUP, Ctrl-C, SIGTERM."
 )
 

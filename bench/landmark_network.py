@@ -90,6 +90,16 @@ def _pip() -> list[str]:
     raise UnavailableError(f"{FETCH} needs pip, which is not installed.", f"{sys.executable} -m ensurepip")
 
 
+def interpreter_class() -> Any:
+    """The class that runs the networks. Raises `UnavailableError` without its package."""
+    try:
+        from ai_edge_litert.interpreter import Interpreter
+    except ImportError as error:
+        what = "Networks of MediaPipe need the package ai-edge-litert; it is not installed."
+        raise UnavailableError(what, f"pip install ai-edge-litert, or: {install_extra('track')}") from error
+    return Interpreter
+
+
 def open_network(path: Path, expected: str) -> Any:
     """The interpreter of a file, with one thread.
 
@@ -101,13 +111,9 @@ def open_network(path: Path, expected: str) -> Any:
     if not path.exists():
         remedy = f"{FETCH} fetches it ({WHEEL}, {LICENCE})."
         raise InputError(path, "", expected, "no such file", remedy)
+    interpreter = interpreter_class()
     try:
-        from ai_edge_litert.interpreter import Interpreter
-    except ImportError as error:
-        what = "Networks of MediaPipe need the package ai-edge-litert; it is not installed."
-        raise UnavailableError(what, f"pip install ai-edge-litert, or: {install_extra('track')}") from error
-    try:
-        network = Interpreter(model_path=str(path), num_threads=1)
+        network = interpreter(model_path=str(path), num_threads=1)
         network.allocate_tensors()
     except (ValueError, RuntimeError) as error:
         raise InputError(path, "", expected, str(error)) from error

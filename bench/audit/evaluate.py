@@ -42,6 +42,7 @@ from ..io.files import (
     digest_file,
 )
 from ..io.images import probe_image, read_pixels, read_png, write_png
+from ..machine import check_device
 from ..options import DependentOptions
 from ..protocol import Protocol, check_capture, make_protocols, needed
 from ..registry import discover, get, resolve
@@ -249,6 +250,7 @@ def evaluate_folder(settings: EvaluateSettings, progress: Progress = no_progress
 
     The text is the table, together with the run named by ``like``.
     """
+    check_device(settings.device)
     source = Path(settings.folder)
     if settings.truth is not None:
         masks = None if settings.masks is None else Path(settings.masks)

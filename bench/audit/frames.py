@@ -19,7 +19,7 @@ from ..engine.store import Cell, RunFolder
 from ..errors import InputError
 from ..io.documents import read_text
 from ..io.files import check_output_folder, reading, with_slashes, write_text
-from ..io.images import read_pixels, read_png
+from ..io.images import read_pixels, read_png, write_png
 from ..protocol import make_protocols
 from ..registry import discover, get, resolve, unknown
 from ..specs import CommandResult, DatasetSpec, command
@@ -189,6 +189,9 @@ class FramesSettings(RunOptions):
     reader: str = ""
     """Which dataset reader opens the capture; default: the one that finds it."""
 
+    images: bool = False
+    """Also write the true images as PNG under their file names, for `headbench evaluate --truth`."""
+
 
 FRAMES_FILE, MAP_FILE = "frames.csv", "MAP.csv"
 POSE_COLUMNS = (
@@ -207,20 +210,24 @@ def write_frames(settings: FramesSettings, progress: Progress = no_progress) -> 
     by_subject = {clip.subject: clip for clip in clips}
     pose_files = _pose_files(config, clips)
     frames: list[Sequence[object]] = [POSE_COLUMNS]
-    names: list[Sequence[object]] = [MAP_COLUMNS]
+    named: list[tuple[str, FrameKey]] = []
     for task, protocol in protocols.items():
         for key in protocol.keys:
             name = image_name(task, key).as_posix()
             pose_file = pose_files.get((key.subject, key.timestep), "")
             frames.append((task, *key, name, *_camera(by_subject[key.subject], key), pose_file))
-            names.append((name, *key))
-    out, listing = Path(settings.out), csv_text(names)
+            named.append((name, key))
+    out = Path(settings.out)
+    listing = csv_text([MAP_COLUMNS, *((name, *key) for name, key in named)])
     check_output_folder(out)
     if (out / MAP_FILE).exists() and (out / MAP_FILE).read_text(encoding="utf-8") != listing:
         expected = "no such file, or the template of the same frames"
         raise InputError(out / MAP_FILE, "", expected, "another list", "Move it, or choose another --out.")
     write_text(out / FRAMES_FILE, csv_text(frames))
     write_text(out / MAP_FILE, listing)
+    for done, (name, key) in enumerate(named if settings.images else (), 1):
+        write_png(out / name, by_subject[key.subject].image(key))
+        progress(done, len(named), "images")
     counts = {task: len(protocol.keys) for task, protocol in protocols.items()}
     hashes = {task: protocol.hash for task, protocol in protocols.items()}
     shown = ", ".join(f"{count} of {task} (protocol {hashes[task]})" for task, count in counts.items())

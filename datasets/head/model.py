@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...bench.contracts import Camera, Clip, FloatArray, HeadAsset, HeadPose
+from ...bench.contracts import Camera, Clip, FloatArray, FrameKey, HeadAsset, HeadPose
 from ...bench.errors import InputError
 from ...bench.native.dispatch import to_device
 from .rotations import axis_angle_to_matrix, rotation_of
@@ -393,3 +393,15 @@ def resting(head: HeadAsset, subject: str = "") -> HeadPose:
     expression, none = np.zeros(head.expression_basis.shape[2]), np.zeros(3)
     lids = None if head.eyelid_basis is None else np.zeros(head.eyelid_basis.shape[2])
     return HeadPose(head.version, expression, none, none, none, np.zeros(6), none, lids, subject)
+
+
+def frontal_key(clip: Clip, timestep: int) -> FrameKey:
+    """Training frame of a timestep from the most frontal camera."""
+    pose = clip.poses[timestep]
+    facing = rotation_of(pose.rotation).apply([0.0, 0.0, 1.0])
+
+    def directness(key: FrameKey) -> float:
+        towards = clip.cameras[key.camera].center - pose.translation
+        return float(facing @ towards / np.linalg.norm(towards))
+
+    return max((key for key in clip.splits["train"] if key.timestep == timestep), key=directness)

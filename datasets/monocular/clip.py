@@ -294,6 +294,18 @@ def _sequences(splits: Mapping[str, Sequence[FrameKey]]) -> dict[FrameKey, Frame
     return names
 
 
+def check_frame_count(video: Path, count: int, held_out: int | None, tolerance: int = 0) -> None:
+    """Raise `InputError` for a video with too few frames to train on some and hold out others.
+
+    ``tolerance``: Number of frames by which ``count`` may be too small.
+    """
+    least = SHORT_SHARE if held_out is None else held_out + 1
+    if count + tolerance < least:
+        raise InputError(
+            video, "frames", f"at least {least} with a face, to hold out {held_out or 1}", str(count)
+        )
+
+
 def _last(count: int, asked: int | None) -> tuple[int, str]:
     if asked is not None:
         return asked, f"the last {asked} frames by name, as asked for"

@@ -13,11 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from scipy.spatial.transform import Rotation
 
-from ...bench.contracts import ByteArray, Clip, FloatArray, FrameKey, HeadPose, Progress, no_progress
+from ...bench.contracts import ByteArray, Clip, FloatArray, HeadPose, Progress, no_progress
 from ...bench.io.figures import pixels
 from ..clip import CaptureClip
-from ..head.model import PosedSubject, pose_in_head_frame
-from ..head.rotations import rotation_of
+from ..head.model import PosedSubject, frontal_key, pose_in_head_frame
 from ..inspect.figure import HELD_OUT, LEAK, MUTED, TRAIN, bands, new_figure, shortened, show
 from ..mesh_pictures import draw_mesh, portrait_camera
 from .clusters import DEFAULT_COUNT, ExpressionClusters, jaw_bases, jaw_quaternions, jaw_weights, leaks
@@ -171,18 +170,6 @@ def draw_strips(axes: Axes, sequences: Mapping[str, Sequence[int]]) -> None:
     axes.set_xticks([])
     axes.spines[:].set_visible(False)
     axes.set_title("clusters over time, by training sequence", color=MUTED)
-
-
-def frontal_key(clip: CaptureClip, timestep: int) -> FrameKey:
-    """Training frame of a timestep from the most frontal camera."""
-    pose = clip.poses[timestep]
-    facing = rotation_of(pose.rotation).apply([0.0, 0.0, 1.0])
-
-    def directness(key: FrameKey) -> float:
-        towards = clip.cameras[key.camera].center - pose.translation
-        return float(facing @ towards / np.linalg.norm(towards))
-
-    return max((key for key in clip.splits["train"] if key.timestep == timestep), key=directness)
 
 
 def cluster_colour(rank: int) -> tuple[float, float, float]:

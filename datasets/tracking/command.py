@@ -13,7 +13,8 @@ from ...bench.contracts import Progress, no_progress
 from ...bench.errors import InputError
 from ...bench.io.documents import checked, read_json
 from ...bench.io.files import write_json
-from ...bench.landmark_network import LICENCE, WHEEL, fetch_networks
+from ...bench.io.videos import is_video
+from ...bench.landmark_network import LICENCE, WHEEL, fetch_networks, interpreter_class
 from ...bench.manifest import cut_of
 from ...bench.progress import counted
 from ...bench.protocol import evenly_with_ends
@@ -43,9 +44,31 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     """Track the head model of a capture in its images, without using its tracking.
 
     Writes under ``settings.out`` the capture (images linked), ``track.json`` with every timestep's residuals and
-    ``overlay.png``. Intermediate results are stored there, so that an interrupted call can be resumed.
+    ``overlay.png``. Intermediate results are stored there, so that an interrupted call can be resumed; a call that refuses its
+    input removes those that it made.
     """
-    from ...bench.io.videos import is_video
+    if settings.fetch_networks:
+        files = fetch_networks()
+        text = f"Networks of {WHEEL} ({LICENCE}):"
+        return CommandResult("\n".join([text, *map(str, files)]), {"networks": [*map(str, files)]})
+    if settings.program != "light":
+        from .programs import track_with_program
+
+        return track_with_program(settings, progress)
+    work = Path(settings.out, WORK)
+    check_work_folder(work)
+    if is_video(Path(settings.capture)):
+        interpreter_class()  # refuses before any slow import
+    resumed = work.exists()
+    try:
+        return _track(settings, work, progress)
+    except InputError:
+        if not resumed:
+            shutil.rmtree(work, ignore_errors=True)
+        raise
+
+
+def _track(settings: TrackSettings, work: Path, progress: Progress) -> CommandResult:
     from ..clip import check_apart
     from ..ga.writer import capture_plan, write_capture
     from ..images import write_image
@@ -53,18 +76,9 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     from ..steps.masks import label_files, without_torso
     from ..video.command import video_to_track
     from .landmarks import landmark_source
-    from .programs import track_with_program
     from .track import LandmarkSource, check_cameras, track, tracking_errors
 
-    if settings.fetch_networks:
-        files = fetch_networks()
-        text = f"Networks of {WHEEL} ({LICENCE}):"
-        return CommandResult("\n".join([text, *map(str, files)]), {"networks": [*map(str, files)]})
-    if settings.program != "light":
-        return track_with_program(settings, progress)
-    out = Path(settings.out)
-    work = out / WORK
-    check_work_folder(work)
+    out = work.parent
     used = {name: value for name, value in asdict(settings).items() if name not in ("out", "against")}
     _check_same_settings(out / REPORT, used)
     if is_video(Path(settings.capture)):

@@ -31,7 +31,15 @@ from ..ga.validate import content_digests
 from ..head.arrays import HeadArrays
 from ..head.model import resting
 from ..images import read_mask, write_image
-from ..monocular.clip import VIDEO, Track, VideoFrame, check_subject, clip_of_track, subject_of
+from ..monocular.clip import (
+    VIDEO,
+    Track,
+    VideoFrame,
+    check_frame_count,
+    check_subject,
+    clip_of_track,
+    subject_of,
+)
 from ..tracking.settings import MASKLESS, TRACKER_VERSION, USUAL_FOCAL, VideoOptions
 from .faces import Crop, FaceFinder, FoundFaces, crop_around, find_faces
 from .matting import refined_mask, without_room
@@ -187,9 +195,12 @@ def open_video(
     check_subject(subject, "--subject")
     info = probe_video(path)
     masks = MaskSource(options)
+    count = min(options.longest or info.frames, info.frames)
+    check_frame_count(path, count, options.held_out_frames, tolerance=2)  # of what the file says
     mark = digest(TRACKER_VERSION, digest_file(path), finder.digest, options.rate, options.longest)
     faces = find_faces(path, _frames(path, options), finder, out / FACES, mark, progress)
     numbers = faces.numbers[faces.found].tolist()
+    check_frame_count(path, len(numbers), options.held_out_frames)
     mark = digest(mark, options.size, masks.prepare(numbers, info))
     folder = out / f"{IMAGES}-{mark[:16]}"
     for other in out.glob(f"{IMAGES}-*"):

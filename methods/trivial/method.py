@@ -30,10 +30,11 @@ from ...bench.errors import InputError
 from ...bench.io.arrays import MAX_MAGNITUDE, TEXT, Member, read_arrays
 from ...bench.io.images import read_pixels
 from ...bench.protocol import evenly_with_ends
-from ...datasets.head.model import PosedSubject
+from ...datasets.head.model import PosedSubject, frontal_key
 from ...datasets.images import write_image
 from ...datasets.mesh_pictures import rasterize_mesh
 from ..shared.avatar_files import (
+    HEAD_FILE,
     SUBJECT_FILE,
     TRACKED,
     Subject,
@@ -45,7 +46,7 @@ from ..shared.avatar_files import (
 )
 from ..shared.loop import Fit, TrainingSummary
 from ..shared.method import TrainedMethod
-from .spec import MEAN_IMAGE, NEAREST_CAMERA, TEXTURED_MESH, NearestCameraConfig
+from .spec import MEAN_IMAGE, NEAREST_CAMERA, ONE_PICTURE, TEXTURED_MESH, NearestCameraConfig
 
 TEXTURE_FILE = "texture.npz"
 _TEXTURE = {"colors": Member("u", ("F", "T", 3), None, "u1")}
@@ -81,6 +82,10 @@ class TexturedMeshAvatar:
         """The texture and the subject."""
         return [self._folder / TEXTURE_FILE, self._folder / SUBJECT_FILE]
 
+    def shared_files(self) -> Sequence[Path]:
+        """The head model."""
+        return [self._folder / HEAD_FILE]
+
     def render(self, camera: Camera, pose: HeadPose, background: Sequence[float] = (1.0, 1.0, 1.0)) -> Frame:
         """The mesh before the background."""
         (vertices,) = self._mesh.meshes([pose])
@@ -109,7 +114,7 @@ class TexturedMesh(TrainedMethod[None, TexturedMeshAvatar]):
 
     def _train(self, fit: Fit, config: None) -> None:
         clip, mesh = fit.clip, PosedSubject.of(fit.clip)
-        samples = _samples(fit, mesh)
+        samples = _samples(fit, mesh, self._frames(clip))
         if not len(samples.face):
             expected = "training images in which the posed mesh covers pixels of the subject"
             raise InputError(
@@ -121,12 +126,38 @@ class TexturedMesh(TrainedMethod[None, TexturedMeshAvatar]):
         rows = int(np.clip(np.ceil((len(samples.face) / len(visible)) ** 0.5), 1, MOST_ROWS))
         places = texels(samples.face, samples.weights, rows)
         colors, seen = _medians(places, samples.colors, count * rows**2)
-        if not seen.all():  # the colour of the nearest one
+        if not seen.all():
             centres = _centres(mesh.neutral[np.asarray(clip.head.faces)], rows)
-            colors[~seen] = colors[seen][cKDTree(centres[seen]).query(centres[~seen])[1]]
+            colors[~seen] = colors[seen][self._nearest(centres[seen], centres[~seen])]
         write_arrays(fit.out / TEXTURE_FILE, {"colors": colors.reshape(count, -1, 3)})
         images = int(samples.image[-1]) + 1
         finish_fit(fit, TrainingSummary(images, images, 0.0), Subject.of(clip), clip.head)
+
+    def _frames(self, clip: Clip) -> list[FrameKey]:
+        """The training frames whose colours are taken, in temporal order."""
+        keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
+        pixels = max(camera.width * camera.height for camera in clip.cameras.values())
+        return evenly_with_ends(keys, max(1, SAMPLES // pixels))
+
+    def _nearest(self, seen: FloatArray, unseen: FloatArray) -> IntArray:
+        """Which of the ``seen`` points (N, 3) of the neutral mesh gives each of the ``unseen`` points (M, 3) its colour."""
+        return np.asarray(cKDTree(seen).query(unseen)[1])
+
+
+class OnePicture(TexturedMesh):
+    """Takes the colours of one picture: of the first training timestep, from the most frontal camera.
+
+    A texel that the picture does not show has the colour of the nearest one that it shows, where both halves of the face
+    are taken to be equal: seen points also count at their mirror images, x being the axis from right to left of every head model.
+    """
+
+    name, version = ONE_PICTURE.name, ONE_PICTURE.version
+
+    def _frames(self, clip: Clip) -> list[FrameKey]:
+        return [frontal_key(clip, min(key.timestep for key in clip.splits["train"]))]
+
+    def _nearest(self, seen: FloatArray, unseen: FloatArray) -> IntArray:
+        return super()._nearest(np.concatenate([seen, seen * [-1, 1, 1]]), unseen) % len(seen)
 
 
 class MeshSamples(NamedTuple):
@@ -138,11 +169,8 @@ class MeshSamples(NamedTuple):
     colors: ByteArray
 
 
-def _samples(fit: Fit, mesh: PosedSubject) -> MeshSamples:
+def _samples(fit: Fit, mesh: PosedSubject, keys: Sequence[FrameKey]) -> MeshSamples:
     clip = fit.clip
-    keys = sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera))
-    pixels = max(camera.width * camera.height for camera in clip.cameras.values())
-    keys = evenly_with_ends(keys, max(1, SAMPLES // pixels))
     meshes = mesh.each(clip, list(dict.fromkeys(key.timestep for key in keys)))
     timestep, vertices = next(meshes)
     parts: list[MeshSamples] = []

@@ -46,3 +46,11 @@ TEXTURED_MESH = MethodSpec(
     trivial=True,
     presets=PRESETS,
 )
+
+ONE_PICTURE = MethodSpec(
+    name="one-picture",
+    summary="The textured mesh with the colours of one picture: a baseline of methods that are given one picture.",
+    implementation="headbench.methods.trivial.method:OnePicture",
+    trivial=True,
+    presets=PRESETS,
+)

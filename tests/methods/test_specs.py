@@ -19,11 +19,12 @@ from headbench.methods.ours.spec import OURS, Lines, OursConfig, OuterLayers, Pe
 from headbench.methods.rgbavatar.spec import RGBAVATAR, RGBAvatarConfig
 from headbench.methods.shared.config import SplatTraining
 from headbench.methods.shared.schedule import DensifySchedule, Timeline
-from headbench.methods.trivial.spec import MEAN_IMAGE, NEAREST_CAMERA, TEXTURED_MESH
+from headbench.methods.trivial.spec import MEAN_IMAGE, NEAREST_CAMERA, ONE_PICTURE, TEXTURED_MESH
 
 SPECS = {
     spec.name: spec
-    for spec in (FLASHAVATAR, OURS, GA, GBS, GHA, INSTA, RGBAVATAR, MEAN_IMAGE, NEAREST_CAMERA, TEXTURED_MESH)
+    for spec in (FLASHAVATAR, OURS, GA, GBS, GHA, INSTA, RGBAVATAR)
+    + (MEAN_IMAGE, NEAREST_CAMERA, TEXTURED_MESH, ONE_PICTURE)
 }
 PRESETS = ("smoke", "quick", "demo", "fast", "gpu", "paper")
 

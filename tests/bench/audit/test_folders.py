@@ -185,6 +185,12 @@ def test_metrics_that_need_more_than_images_are_refused(folders, capsys, metric,
     assert message in capsys.readouterr().err
 
 
+def test_a_device_that_torch_lacks_is_refused(folders, capsys):
+    words = ["renders", "--truth", "truth", "--metrics", "l1", "--device", "banana"]
+    assert cli.main(["evaluate", *words]) == 2
+    assert "device, banana" in capsys.readouterr().err
+
+
 @pytest.fixture
 def videos(folders):
     """Videos of twelve frames."""

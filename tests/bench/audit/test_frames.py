@@ -12,7 +12,7 @@ import pytest
 from headbench.bench import cli
 from headbench.bench.contracts import FrameKey
 from headbench.bench.engine.store import RunFolder
-from headbench.bench.io.images import write_png
+from headbench.bench.io.images import read_png, write_png
 
 
 def listed(path):
@@ -23,14 +23,15 @@ def listed(path):
 @pytest.mark.parametrize("renamed", [False, True])
 def test_the_ground_truth_by_the_listed_names_scores_perfectly(run, toy, tmp_path, renamed):
     out, images = tmp_path / "frames", tmp_path / "images"
-    assert cli.main(["frames", str(run), "--out", str(out), "--trust"]) == 0
+    assert cli.main(["frames", str(run), "--out", str(out), "--trust", "--images"]) == 0
     frames, names = listed(out / "frames.csv"), listed(out / "MAP.csv")
     assert [row["file"] for row in frames] == [row["file"] for row in names]
     clip = toy.read("subject1")
     for number, row in enumerate(names):
+        key = FrameKey(row["subject"], row["sequence"], int(row["timestep"]), row["camera"])
+        np.testing.assert_array_equal(read_png(out / row["file"]), clip.image(key))
         if renamed:
             row["file"] = f"mine/{number}.png"
-        key = FrameKey(row["subject"], row["sequence"], int(row["timestep"]), row["camera"])
         write_png(images / row["file"], clip.image(key))
     arguments = ["--like", str(run), "--label", "theirs", "--out", str(tmp_path / "theirs"), "--trust"]
     if renamed:

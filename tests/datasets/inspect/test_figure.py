@@ -13,7 +13,7 @@ from headbench.bench.errors import InputError
 from headbench.bench.io.documents import read_json
 from headbench.bench.io.figures import pixels
 from headbench.datasets.ga.reader import read_capture
-from headbench.datasets.head.model import PosedSubject
+from headbench.datasets.head.model import PosedSubject, frontal_key
 from headbench.datasets.inspect.command import (
     NUMBERS,
     PICTURE,
@@ -36,7 +36,6 @@ from headbench.datasets.inspect.figure import (
 from headbench.datasets.inspect.statistics import expression_space
 from headbench.datasets.steps.figures import (
     find_jaw_bases,
-    frontal_key,
 )
 
 from ..lint.good_capture import FRONTAL, read_rgb

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+import sys
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from headbench.bench.contracts import Camera
-from headbench.bench.errors import InputError
+from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.io.videos import video_frames
 from headbench.bench.landmark_network import COUNT
 from headbench.datasets.ga.reader import read_capture
@@ -123,6 +124,7 @@ def settings(filmed, monkeypatch, tmp_path):
     monkeypatch.setattr(fit, "COARSE", 0)
     monkeypatch.setattr(fit, "LAST", fit.LEVELS[0])
     monkeypatch.setattr(focal, "TRIED", focal.TRIED[1:6:2])
+    monkeypatch.setattr(tracking_command, "interpreter_class", lambda: None)
     monkeypatch.setattr(command, "FaceFinder", Network)
     monkeypatch.setattr(video_clip, "crop_around", lambda faces, width, height: Crop(0, 0, width, height))
     given = {
@@ -169,18 +171,38 @@ def test_a_video_becomes_a_capture_of_its_frames(settings, filmed, monkeypatch):
         ({"segmentation": "a.tflite"}, "found both"),
         ({"head": "2020"}, "head_model"),
         ({"masks": "nowhere"}, "nowhere"),
-        ({"longest": 1}, "frames for training"),
+        ({"longest": 3}, "me.mp4, frames: expected at least 4 with a face, to hold out 1, found 3"),
+        (
+            {"held_out_frames": 11},
+            "me.mp4, frames: expected at least 12 with a face, to hold out 11, found 11",
+        ),
     ],
 )
 def test_what_is_missing_is_said(settings, changes, named):
     with pytest.raises(InputError, match=named):
         track_capture(settings(**changes))
+    assert not Path(settings().out, WORK).exists()
+
+
+def test_too_few_frames_are_refused_before_any_face(settings, monkeypatch):
+    monkeypatch.setattr(command.FaceFinder, "find_all", None)
+    with pytest.raises(InputError, match="me.mp4, frames: expected at least 1000 .* found 12"):
+        track_capture(settings(held_out_frames=999))
+
+
+def test_a_missing_package_is_said_before_the_video(settings, monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
+    monkeypatch.setattr(command, "video_to_track", None)
+    with pytest.raises(UnavailableError, match="ai-edge-litert"):
+        track_capture(settings())
 
 
 def test_a_face_unlike_the_head_model_is_refused(settings, monkeypatch):
     monkeypatch.setattr(landmarks, "MOST_MISFIT", 0.0)  # as for a drawn face
     with pytest.raises(InputError, match="fit the head model in at least 50%.*it in 0 of 11"):
         track_capture(settings(focal=None))
+    assert not Path(settings().out, WORK).exists()
 
 
 class Stopped(Exception):
@@ -244,6 +266,8 @@ def test_a_call_that_is_interrupted_repeatedly_is_continued(settings, filmed, mo
         done, stopped = finished_calls(monkeypatch, settings(**changes), *stop)
         assert stopped is None
         counts += done
+    with pytest.raises(InputError, match="at least 500"):  # keeps what there is
+        track_capture(settings(**changes, held_out_frames=499))
     done, again = finished_calls(monkeypatch, settings(**changes))
     assert (counts + done).tolist() == wanted.tolist()
     for result in (whole, again):

@@ -7,13 +7,14 @@ import pytest
 
 from headbench.bench.contracts import Budget, no_progress
 from headbench.bench.errors import InputError
-from headbench.datasets.head.model import PosedSubject
+from headbench.datasets.head.model import PosedSubject, frontal_key
 from headbench.datasets.mesh_pictures import draw_mesh
 from headbench.methods.trivial.method import (
     INDEX_FILE,
     MEAN_FILE,
     MeanImage,
     NearestCamera,
+    OnePicture,
     TexturedMesh,
     _centres,
     _medians,
@@ -83,6 +84,43 @@ def test_a_painted_mesh_is_drawn_again(clip, tmp_path):
         gap = np.abs(frame.rgb - painted.image(key) / 255)[inside]
         assert np.median(gap) < 0.04  # a colour changes by about as much from pixel to pixel
         assert frame.alpha.min() == 0
+
+
+class Recorded(Painted):
+    """A painted clip that notes the frames whose images are read."""
+
+    def __init__(self, clip):
+        super().__init__(clip)
+        self.read = set()
+
+    def image(self, key):
+        self.read.add(key)
+        return super().image(key)
+
+
+def test_one_picture_is_all_that_it_sees_and_it_moves(clip, tmp_path):
+    seen = Recorded(clip)
+    avatar = fit(OnePicture(), seen, tmp_path / "one")
+    mesh = train(Painted(clip), tmp_path / "all")
+    (source,) = seen.read
+    first = min(key.timestep for key in clip.splits["train"])
+    assert source in clip.splits["train"]
+    assert source == frontal_key(clip, first)
+    frame = show(avatar, clip, source, background=clip.background)
+    inside = frame.alpha == 1
+    assert inside.mean() > 0.05
+    gap = np.abs(frame.rgb - Painted.image(seen, source) / 255)[inside]
+    assert np.median(gap) < 0.02
+    key = clip.splits["self_reenactment"][0]
+    moved = show(avatar, clip, key)
+    np.testing.assert_array_equal(moved.alpha, show(mesh, clip, key).alpha)
+    assert (moved.alpha != show(avatar, clip, key._replace(timestep=first)).alpha).any()
+
+
+def test_one_half_of_the_face_colours_the_other():
+    seen, unseen = np.array([[1.0, 0, 0], [-0.2, 1, 0]]), np.array([[-1.1, 0, 0], [0.1, 1, 0.3], [2, 0, 0]])
+    assert OnePicture()._nearest(seen, unseen).tolist() == [0, 1, 0]
+    assert TexturedMesh()._nearest(seen, unseen).tolist() == [1, 1, 0]
 
 
 def test_a_head_outside_of_all_pictures_is_an_error(clip, tmp_path):
