@@ -173,7 +173,8 @@ def main_table(runs: RunSet) -> str:
     for name in sorted(cells, key=lambda name: -float(cells[name][0])):
         lines.append([f"`{name}`", *(f"**{v}**" if v == top else v for v, top in zip(cells[name], best))])
     how = f"{runs.image_size} pixels, times on {runs.machine} beside other programs"
-    return f"{pipe_table(lines)}\n\nMeans over {len(runs.rows.subjects)} subjects, the best in bold; images of {how}."
+    subjects = counted(len(runs.rows.subjects), "subject")
+    return f"{pipe_table(lines)}\n\nMeans over {subjects}, the best in bold; images of {how}."
 
 
 def findings(suite: RunSet, curve: CurveData) -> str:
@@ -187,29 +188,30 @@ def findings(suite: RunSet, curve: CurveData) -> str:
     planned = planned_subjects(suite)
     interim = f"; interim, {planned} are planned" if novel.subjects < planned else ""
     longest = max(point.cost[curve.clock] or 0.0 for point in curve.means)
-    after = {
-        seconds: " and ".join(f"`{best_at(curve, task, seconds)}` in {what}" for task, what in SPOKEN.items())
-        for seconds in (60.0, longest)
-    }
+    after = [best_at(curve, seconds) for seconds in (60.0, longest)]
     return f"""\
 - In the face at cameras without training images, `{OURS}` minus `{REFERENCE}` is {novel.text(1)} dB in novel views and {new.text(1)} dB \
-in new expressions (means over subjects with 95 % intervals{interim}), with about {fmean(trainings):.0f} processor seconds of training.
+in new expressions (means over {counted(novel.subjects, "subject")} with 95 % intervals{interim}), with about {fmean(trainings):.0f} processor seconds of training.
 - Lines that move splats (`{MOVED}`) instead of changing their opacity change novel views by {novel_moved.text(1)} dB and new \
 expressions by {new_moved.text(1)} dB in the face; in Table 4 of the paper of `{OURS}` by +1.2 and -0.7 dB.
-- With one minute of training on one processor the face is best of {after[60.0]}, with {longest / 60:.0f} minutes of {after[longest]} \
+- With one minute of training on one processor the best face is that of {after[0]}; with {longest / 60:.0f} minutes that of {after[1]} \
 ({counted(len(curve.subjects), "development subject")}, at most 20,000 splats; longer trainings are not measured)."""
 
 
 SPOKEN = {
     NOVEL: "novel views",
-    UNSEEN_CAMERAS: "new expressions at cameras without training images",
-    SEEN_CAMERAS: "new expressions at cameras with them",
+    UNSEEN_CAMERAS: "new expressions at unseen cameras",
+    SEEN_CAMERAS: "new expressions at seen cameras",
 }
 
 
-def best_at(curve: CurveData, task: str, seconds: float) -> str:
-    """The method with the best mean PSNR of the face at a number of processor seconds."""
-    return [each.method for each in curve.best[f"psnr_{FACE}", task] if each.start <= seconds][-1]
+def best_at(curve: CurveData, seconds: float) -> str:
+    """The methods with the best mean PSNR of the face after a number of processor seconds, each with its tasks."""
+    tasks: dict[str, list[str]] = defaultdict(list)
+    for task, what in SPOKEN.items():
+        leading = [each.method for each in curve.best[f"psnr_{FACE}", task] if each.start <= seconds]
+        tasks[leading[-1]].append(what)
+    return " and ".join(f"`{method}` ({', '.join(own)})" for method, own in tasks.items())
 
 
 def moved_lines(recorded: RunSet, exact: RunSet) -> str:
@@ -219,7 +221,7 @@ def moved_lines(recorded: RunSet, exact: RunSet) -> str:
     opacity, moved = ({key: float(value) for key, value in row.values.items()} for row in table.rows)
     printed = {key.split("/")[0]: moved[key] - opacity[key] for key in moved if key.endswith("/psnr")}
     lines = [
-        ["PSNR, dB", *(TASK_TITLES[task] for task in tasks), "novel view minus unseen cameras", "subjects"]
+        ["PSNR (dB)", *(TASK_TITLES[task] for task in tasks), "novel view minus unseen cameras", "subjects"]
     ]
     lines.append(["---", *["--:"] * (2 + len(tasks))])
     both = printed[NOVEL], printed["self_reenactment"]
