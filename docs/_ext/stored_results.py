@@ -40,7 +40,6 @@ from headbench.reports.suite.suite import (
     planned_subjects,
     primary_table,
     read_extremes,
-    suite_report,
     suite_runs,
 )
 from headbench.reports.table_report import Columns, table_of
@@ -136,20 +135,15 @@ class StoredResults:
         return self.recorded.only(self.recorded.ranked).shared.by_camera
 
     def write(self) -> None:
-        """Write every block into its page, and all tables and means of the suite into their files."""
+        """Write every block into its page, and means of the suite into their file."""
         for (name, block), text in self.blocks().items():
             page = self.root / name
             write_text(page, page.read_text(encoding="utf-8").replace(block_of(page, block), text))
-        write_text(self.gallery / "suite" / "results.md", self.results())
         write_json(self.root / "reports" / "measured.json", self.measured())
 
-    def results(self) -> str:
-        """All tables of the suite."""
-        return suite_report(self.gallery / "suite", OURS, lambda folders: self.read(*folders))
-
     def measured(self) -> dict[str, object]:
-        """Means of the suite, as `MeasuredFigures` has them; over all cameras, as papers print them."""
-        runs = self.suite
+        """Means on captures as recordings are, as `MeasuredFigures` has them; over all cameras, as papers print them."""
+        runs = self.recorded
         metrics = [spec for spec in runs.metrics if "comparison" in spec.tables]
         table = build_table(runs.listing(runs.ranked), metrics, runs.tasks)
         names = [column.name for column in table.columns]
