@@ -303,6 +303,14 @@ def make_protocols(
     return {task: make_protocol(task, clips, max_frames) for task in done}
 
 
+def run_protocols(
+    tasks: Sequence[TaskName], clips: Sequence[Clip], max_frames: int | None
+) -> dict[str, Protocol]:
+    """As `make_protocols`; none if no clip holds out frames, as training data of hidden tests do not."""
+    held_out = (keys for clip in clips for split, keys in clip.splits.items() if split != "train")
+    return make_protocols(tasks, clips, max_frames) if any(held_out) else {}
+
+
 def joined_protocol(protocols: Sequence[Protocol]) -> Protocol:
     """Join the protocols of one task: the protocol of one run that scored all of their clips.
 

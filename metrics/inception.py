@@ -43,9 +43,10 @@ class Inception:
 
 
 def resized(image: ByteArray) -> FloatArray:
-    """(299, 299, 3) float32 levels: each channel resized by Pillow's bicubic filter, antialiased and not rounded."""
+    """(299, 299, 3) float32 levels from 0 to 255: each channel resized by Pillow's bicubic filter, antialiased and not rounded."""
     channels = (Image.fromarray(image[..., i].astype(np.float32)) for i in range(3))
-    return np.stack([np.asarray(c.resize((SIDE, SIDE), Image.Resampling.BICUBIC)) for c in channels], axis=2)
+    planes = [np.asarray(c.resize((SIDE, SIDE), Image.Resampling.BICUBIC)) for c in channels]
+    return np.stack(planes, axis=2).clip(0, 255)
 
 
 class Convolution(nn.Module):

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from .aggregate import summarise, whole_images
+from .aggregate import conditions, summarise, whole_images
 from .papers import OF_AVATARS, OF_FRAMES, Claim, Paper, PrintedRow
 from .runs import RunSet
 from .writers import pipe_table
@@ -68,7 +68,7 @@ def _finding(claim: Claim, key: str, pair: Sequence[PrintedRow], runs: RunSet | 
     if runs is None:
         return ClaimValue(key, printed, None, False, f"no run of {claim.table}")
     task, _, metric = key.rpartition("/")
-    values, sources = [], []
+    values, sources, labels = [], [], []
     for row in pair:
         if not (label := measured_label(runs, row)):
             return ClaimValue(key, printed, None, False, f"{row.name} was not run")
@@ -77,13 +77,27 @@ def _finding(claim: Claim, key: str, pair: Sequence[PrintedRow], runs: RunSet | 
             return ClaimValue(key, printed, None, False, f"{label}: {found.reason}")
         count = len(whole_images(runs.rows, label, metric, task))
         values.append(found.value)
+        labels.append(label)
         folder = runs.pictured[label][0].folder.root
         sources.append(f"{folder.parent.name}/{folder.name}: {label}, {count} rows")
+    if differ := _different_places(runs, metric, labels):
+        return ClaimValue(key, printed, None, False, f"{metric} was measured on different machines: {differ}")
     measured = _difference(values)
     higher = (OF_FRAMES if task else OF_AVATARS)[metric][2]
     return ClaimValue(
         key, printed, measured, _holds(claim, key, printed, measured, higher), "; ".join(sources)
     )
+
+
+def _different_places(runs: RunSet, metric: str, labels: Sequence[str]) -> str:
+    """Where a time was measured by method, if that differs, as tables mark it; otherwise ""."""
+    specs = [spec for spec in runs.metrics if spec.name == metric]
+    places = {
+        label: found.text or runs.pictured[label][0].machine
+        for label, found in conditions(runs.rows, specs, labels).get(metric, {}).items()
+    }
+    differ = len({*places.values()}) > 1
+    return "; ".join(f"{label}: {place}" for label, place in places.items()) if differ else ""
 
 
 def _difference(values: Sequence[float]) -> float:

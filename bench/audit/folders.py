@@ -174,6 +174,11 @@ class _Video:
             return self._kept[number]
 
 
+def _highest_level(path: Path) -> int:
+    """Highest level of a video."""
+    return max(int(frame.image.max()) for frame in video_frames(path))
+
+
 OPEN = 6
 """Number of videos that are open at a time."""
 
@@ -185,6 +190,7 @@ class PairedImages:
         self._pairs = {pair.key: pair for pair in pairs}
         self._resize = resize
         self._video = lru_cache(OPEN)(_Video)
+        self._highest_level = lru_cache(_highest_level)
         self.region_names = (MASK, FACE) if pairs[0].mask is not None else ()
 
     def render(self, key: FrameKey) -> ByteArray:
@@ -205,9 +211,12 @@ class PairedImages:
         pair = self._pairs[key]
         assert pair.mask is not None
         levels = self._read(pair.mask, pair.frame).max(axis=2)
-        if 0 < levels.max() < SOLID:
+        highest = int(levels.max())
+        if 0 < highest < SOLID and pair.frame is not None:
+            highest = self._highest_level(pair.mask)  # an empty frame of a lossy video is not quite black
+        if 0 < highest < SOLID:
             expected = f"a mask with levels of {SOLID} to 255 inside"
-            raise InputError(pair.mask, "", expected, f"levels up to {levels.max()}")
+            raise InputError(pair.mask, "", expected, f"levels up to {highest}")
         return dict.fromkeys(names, levels >= SOLID)
 
     def _read(self, path: Path, frame: int | None) -> ByteArray:

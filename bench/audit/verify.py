@@ -22,7 +22,7 @@ from ..errors import ExitCode, InputError
 from ..io.images import read_png
 from ..manifest import ProtocolRecord
 from ..progress import counted
-from ..protocol import make_protocols
+from ..protocol import run_protocols
 from ..rows import ALL, FRAME, Rows
 from ..specs import CommandResult, MetricSpec, command
 from .evaluate import NoAvatar, images_method
@@ -125,7 +125,7 @@ def verify(run: Path, settings: VerifySettings, progress: Progress = no_progress
             now = fingerprints.get(clip.subject, "no such capture")
             if now != clip.fingerprint:
                 findings.differ(f"{folder.manifest}, fingerprint of {clip.subject}", clip.fingerprint, now)
-        protocols = make_protocols(config.tasks, clips, config.frames_per_task)
+        protocols = run_protocols(config.tasks, clips, config.frames_per_task)
         for task in sorted({*protocols, *manifest.protocols}):
             recorded = manifest.protocols.get(task)
             planned = ProtocolRecord.of(protocols[task]) if task in protocols else None

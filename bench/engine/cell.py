@@ -280,13 +280,13 @@ def failed_rows(job: Job, metrics: Sequence[MetricSpec], reason: str) -> Rows:
 def workload(
     form: AdaptedClip, protocols: Mapping[str, Protocol], size: tuple[int, int] | None = None
 ) -> list[tuple[Camera, HeadPose]]:
-    """Cameras and poses of the scored frames in pairs, a new camera and pose in every pair.
+    """Cameras and poses of the scored frames in pairs, a new camera and pose in every pair; of training frames if none is scored.
 
     Cameras are resized to ``size``, (width, height); None for their own.
     """
     clip = form.clip
     keys = [form.key(k) for p in protocols.values() for k in p.keys if k.subject == clip.subject]
-    timesteps = sorted({k.timestep for k in keys})
+    timesteps = sorted({k.timestep for k in keys or clip.splits["train"]})
     cameras = [
         camera if size is None else camera.resized(*size) for _, camera in sorted(clip.cameras.items())
     ]

@@ -26,7 +26,7 @@ from ..manifest import (
     identity_differences,
 )
 from ..progress import RunProgress, duration, progress
-from ..protocol import Protocol, make_protocols, protocol_name
+from ..protocol import Protocol, protocol_name, run_protocols
 from ..registry import get, resolve
 from ..rows import ALL, Rows
 from ..specs import ConditionSpec, MetricSpec
@@ -261,7 +261,7 @@ def make_plan(
         protocols: dict[str, Protocol] = resolve(spec.protocols)(jobs, **config.drive.parameters)
         jobs = [replace(job, protocols=_own(protocols, job.method, job.condition)) for job in jobs]
     else:
-        protocols = make_protocols(config.tasks, clips, config.frames_per_task)
+        protocols = run_protocols(config.tasks, clips, config.frames_per_task)
     manifest = _described(config, cells, metrics, clips, protocols)
     if earlier is not None:
         identities = {label_of(m.spec.name, c.name): m.identity() for m, c in cells}

@@ -143,13 +143,18 @@ class StoredAvatar:
             expected = f"an avatar of {clip.subject}, whom the capture shows"
             raise InputError(self.folder, "subject", expected, f"one of {shown}")
 
+    def shape_of(self, version: str, size: int) -> FloatArray | None:
+        """(S,) shape of the avatar's subject for a head model of this version and size; None for another model."""
+        own = np.asarray(self.record["shape"])
+        return own if self.record["head_model"] == version and own.shape == (size,) else None
+
     def shows_another(self, subject: str, shape: FloatArray, head_model: str) -> str:
         """Name of the avatar's subject if it is not the given one, otherwise "".
 
         The shape decides if the head models are the same, otherwise the name: shapes of different models are not comparable.
         """
-        name, own = self.record["subject"], np.asarray(self.record["shape"])
-        if self.record["head_model"] == head_model and own.shape == np.shape(shape):
+        name, own = self.record["subject"], self.shape_of(head_model, len(shape))
+        if own is not None:
             return name if np.abs(own - shape).max(initial=0.0) > SAME_SHAPE else ""
         return name if name != subject else ""
 

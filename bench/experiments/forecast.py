@@ -1,4 +1,4 @@
-"""Hours and disk space of runs on recordings, from a few pictures, iterations and frames that are measured in place."""
+"""Hours and disk space of runs on recordings, from a few images, iterations and frames that are measured in place."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,31 +41,31 @@ class MethodRates:
 
 @dataclass(frozen=True)
 class Rates:
-    """Measured costs of a picture of a capture, and of each method."""
+    """Measured costs of an image of a capture, and of each method."""
 
-    picture_s: float
-    picture_bytes: float
+    image_s: float
+    image_bytes: float
     methods: dict[str, MethodRates]
 
 
 @dataclass(frozen=True)
 class Amounts:
-    """Subjects, pictures to convert and frames to score of a part."""
+    """Subjects, images to convert and frames to score of a part."""
 
     subjects: int
-    pictures: int
+    images: int
     frames: int
 
     @classmethod
     def of(cls, plans: Sequence[PreparationPlan]) -> Amounts:
         """Count what recordings hold, before frames that show the tongue are left out."""
         jobs = [(plan, job) for plan in plans for job in plan.jobs]
-        pictures = sum(job.count * len(job.cameras) for _, job in jobs)
+        images = sum(job.count * len(job.cameras) for _, job in jobs)
         frames = 0
         for plan, job in jobs:
             held_out = [camera for camera in job.cameras if camera.id in plan.novel_views]
             frames += job.count * len(job.cameras if job.recorded.name in plan.test else held_out)
-        return cls(len(plans), pictures, frames)
+        return cls(len(plans), images, frames)
 
 
 def measure(
@@ -127,6 +128,26 @@ def _rates(folder: RunFolder, subject: str, method: str, timed: int) -> MethodRa
     return MethodRates(iteration, scored / len(renders), size / len(renders))
 
 
+def bytes_left(
+    rates: Rates, runs: Mapping[str, RunConfig], recordings: Mapping[str, Sequence[PreparationPlan]]
+) -> float:
+    """Bytes still to be written: those of images that are not there, and of renders of cells that are not scored."""
+    from ...datasets.nersemble.prepare import count_images
+
+    size = 0.0
+    for part, plans in recordings.items():
+        for job in (job for plan in plans for job in plan.jobs):
+            size += (job.count * len(job.cameras) - count_images(job)) * rates.image_bytes
+        for config in (config for name, config in runs.items() if name.startswith(part)):
+            for plan, (method, condition), seed in product(plans, resolve_cells(config), config.seeds):
+                label = label_of(method.spec.name, condition.name)
+                cell = RunFolder(Path(config.out)).cell(plan.subject, label, seed)
+                if not cell.rows.exists():
+                    frames = Amounts.of([plan]).frames - len([*cell.folder.glob("renders/*/*.png")])
+                    size += frames * rates.methods[method.spec.name].frame_bytes
+    return size
+
+
 def forecast(rates: Rates, runs: Mapping[str, RunConfig], amounts: Mapping[str, Amounts]) -> dict[str, Any]:
     """Hours and GB of each step and in all, and a table of them.
 
@@ -134,8 +155,8 @@ def forecast(rates: Rates, runs: Mapping[str, RunConfig], amounts: Mapping[str, 
     """
     steps: list[tuple[str, str, int, float | None, float]] = []
     for part, amount in amounts.items():
-        size = amount.pictures * rates.picture_bytes
-        steps.append((part, "pictures of captures", amount.pictures, rates.picture_s, size))
+        size = amount.images * rates.image_bytes
+        steps.append((part, "images of captures", amount.images, rates.image_s, size))
         for name, config in runs.items():
             if not name.startswith(part):
                 continue

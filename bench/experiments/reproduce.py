@@ -25,7 +25,7 @@ from ..options import iterations
 from ..protocol import needed
 from ..registry import get
 from ..specs import CommandResult, MethodSpec, command
-from .forecast import TIMESTEPS, Amounts, Rates, forecast, measure
+from .forecast import TIMESTEPS, Amounts, Rates, bytes_left, forecast, measure
 from .specs import MOVED_LINES
 
 if TYPE_CHECKING:
@@ -223,19 +223,19 @@ def _plan(
     else:
         rates = checked(stored["rates"], Rates, out / PLAN_FILE, "rates")
     found = forecast(rates, runs, {part: Amounts.of(plans) for part, plans in recordings.items()})
-    free = shutil.disk_usage(out).free
+    left, free = bytes_left(rates, runs, recordings), shutil.disk_usage(out).free
     how = (
         f"Measured on {TIMESTEPS} timesteps of a training sequence and the held-out one of subject "
         f"{recordings[COMPARISON][0].subject} with {settings.timed} iterations, on one device. Trainings slow down as splats are "
         "added: a lower bound."
     )
     table = pipe_table(found.pop("lines"))
-    text = f"{table}\n\n{how} {found['bytes'] / 1e9:.3g} GB to write, {free / 1e9:.1f} GB free."
+    text = f"{table}\n\n{how} {found['bytes'] / 1e9:.3g} GB, of which {left / 1e9:.3g} are to be written; {free / 1e9:.1f} GB free."
     write_text(out / "plan.md", f"{text}\n")
     if settings.until != "plan":
         log.info("%s", text)  # before hours of work
-        if not (out / "captures").exists() and free < found["bytes"]:
-            expected = f"{found['bytes'] / 1e9:.1f} GB of free space"
+        if free < left:
+            expected = f"{left / 1e9:.1f} GB of free space"
             raise InputError(out, "", expected, f"{free / 1e9:.1f} GB", "Give an --out on another disk.")
     return {**found, "text": text}
 

@@ -241,7 +241,7 @@ def _prepare(plans: Sequence[PreparationPlan], workers: int, progress: Progress)
         with writing(job.folder / RECORD_FILE):
             _write_state(job, started)
             states[job.folder] = started
-    before = {job.folder: _count_images(job) for job in open_jobs}
+    before = {job.folder: count_images(job) for job in open_jobs}
     write_images(open_jobs, workers=workers, progress=progress)
     results = []
     for plan in plans:
@@ -309,10 +309,11 @@ def _has_all_images(job: SequenceJob, state: SequenceState) -> bool:
         return False
     expected = job.count * len(job.cameras)
     masks = len(file_names(job.folder / "fg_masks")) if job.recorded.has_masks else expected
-    return _count_images(job) == expected == masks
+    return count_images(job) == expected == masks
 
 
-def _count_images(job: SequenceJob) -> int:
+def count_images(job: SequenceJob) -> int:
+    """Number of images of a job that are there."""
     wanted = {
         job.image_path(timestep, index).name
         for timestep in range(job.count)

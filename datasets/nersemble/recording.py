@@ -377,7 +377,7 @@ class Calibration:
     world_to_camera: Mapping[str, FloatArray]
     """(4, 4) by serial."""
     intrinsics: Mapping[str, FloatArray]
-    """(3, 3) by serial, pixels of an image of ``size``."""
+    """(3, 3) by serial, pixels of an image of ``size``; of cameras that are not used there may be none."""
     size: tuple[int, int] | None
     """(width, height) that the intrinsics refer to; None if they refer to the images as they are."""
 
@@ -395,6 +395,8 @@ class Calibration:
             found = f"images of {size[0]}x{size[1]} from camera {serial}"
             remedy = "Give height and width in camera_params.json where the recording has another size."
             raise InputError(self.file, "width, height", expected, found, remedy)
+        if serial not in self.intrinsics:
+            raise InputError(self.file, "intrinsics", f"a matrix for camera {serial}", "none")
         K = np.diag([output[0] / width, output[1] / height, 1.0]) @ self.intrinsics[serial]
         return Camera(serial, *output, K, self.world_to_camera[serial])
 
@@ -440,10 +442,9 @@ def read_calibration(path: Path) -> Calibration:
         world_to_camera[serial] = read_rigid(path, f"world_2_cam.{serial}", entry)
     shared = value.get("intrinsics")
     if isinstance(shared, dict):
-        missing = [serial for serial in world_to_camera if serial not in shared]
-        if missing:
-            raise InputError(path, "intrinsics", "a matrix for every camera", f"none for {missing[0]}")
-        intrinsics = {s: _intrinsics(path, f"intrinsics.{s}", shared[s]) for s in world_to_camera}
+        intrinsics = {
+            s: _intrinsics(path, f"intrinsics.{s}", shared[s]) for s in world_to_camera if s in shared
+        }
     else:
         intrinsics = dict.fromkeys(world_to_camera, _intrinsics(path, "intrinsics", shared))
     return Calibration(path, world_to_camera, intrinsics, _size(path, value, isinstance(shared, dict)))

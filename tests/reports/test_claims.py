@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 
 from headbench.bench.configuration import build
@@ -36,6 +37,28 @@ def test_claims_are_met_missed_or_not_run(write_run):
     (speed,) = found["faster-than-insta"].findings
     assert (speed.printed, speed.measured) == (275, pytest.approx(5))
     assert found["ga-novel-view"].findings[0].source == "GA was not run"
+
+
+@pytest.mark.parametrize("recorded", [True, False], ids=["rows", "manifests"])
+def test_speeds_of_different_devices_are_not_compared(write_run, change_manifest, recorded):
+    on_gpu, on_cpu = write_run("gpu", {"ours": 33.0}, {"ours": OPACITY}), write_run("cpu", {"insta": 28.0})
+    for folder, device in ((on_gpu, "cuda"), (on_cpu, "cpu")):
+        if recorded:
+            table = pd.read_parquet(folder / "rows.parquet")
+            table.loc[table["metric"] == "fps", ["machine", "threads"]] = device, 2
+            table.to_parquet(folder / "rows.parquet", index=False)
+        else:
+            change_manifest(folder, lambda m, device=device: m["configuration"].update(device=device))
+    found = judged(on_gpu, on_cpu)
+    assert found["faster-than-insta"].status == "not run"
+    places = (
+        "ours: cuda with 2 threads; insta: cpu with 2 threads"
+        if recorded
+        else "ours: cuda, abacus; insta: abacus"
+    )
+    (speed,) = found["faster-than-insta"].findings
+    assert speed.source == f"fps was measured on different machines: {places}"
+    assert found["better-than-insta"].status == "met"
 
 
 def test_the_ablation_is_found_by_its_settings(write_run):

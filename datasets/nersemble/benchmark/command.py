@@ -39,7 +39,7 @@ class BenchmarkPrepareSettings:
 
     test: tuple[str, ...] = ()
     """Training sequences that are held out, as the benchmark's own test frames are not public; default: none, so that
-    methods are trained on everything, and nothing is measured."""
+    methods are trained on everything, and no frames are measured."""
 
     every: int = 1
     """Keep the frames whose number this divides; of nvs, which has 73 frames a second, the default are all."""

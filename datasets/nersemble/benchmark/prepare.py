@@ -7,6 +7,7 @@ The track of novel views has no tracking, so that its captures are for `headbenc
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,16 +15,24 @@ from pathlib import Path
 import numpy as np
 
 from ....bench.contracts import Camera, FloatArray
+from ....bench.engine.stored import SAME_SHAPE
 from ....bench.errors import InputError
+from ....bench.progress import some
 from ...ga.tracking import POSE_SIZES, pose_to_parameters, resolve_teeth
 from ...head.arrays import HeadArrays
 from ..names import SEQUENCES, match_sequence
 from ..plan import PreparationPlan, SequenceJob
+from ..prepare import read_frames
 from ..recording import Calibration, Participant, read_calibration
 from ..sequence import RecordedSequence, read_sequence
 from ..tracking import TrackedSequence
 from .render import read_sequence as read_tracked_sequence
 from .submission import MONO, BenchmarkTrack, tracking_file
+
+log = logging.getLogger(__name__)
+
+WHITE_LEVEL = 247
+"""Least level of a white background after a video codec."""
 
 
 def plan_participant(
@@ -35,7 +44,7 @@ def plan_participant(
     test: Sequence[str] = (),
     every: int = 1,
 ) -> PreparationPlan:
-    """Read everything about a participant except the pixels."""
+    """Read everything about a participant except the pixels, of which one frame of each sequence is looked at."""
     names = [
         name for name in SEQUENCES if name in one.sequences and (one.sequences[name] / "images").is_dir()
     ]
@@ -49,6 +58,7 @@ def plan_participant(
     calibration = read_calibration(one.calibration_file)
     jobs: list[SequenceJob] = []
     shape: FloatArray | None = None  # of the person, that of the first sequence
+    others: dict[str, float] = {}  # greatest difference to it, by sequence
     for name in names:
         videos = {path.stem.removeprefix("cam_") for path in (one.sequences[name] / "images").glob("*.mp4")}
         serials = [serial for serial in calibration.serials if serial in videos]
@@ -60,21 +70,42 @@ def plan_participant(
             if not view.has_masks:
                 place = recorded.folder / "alpha_maps" / f"cam_{view.serial}.mp4"
                 raise InputError(place, "", "the alpha maps of the frames", "no such file")
+        _check_white(recorded)
         if track is MONO:
-            cameras, tracked = _tracked(data, recorded, head, shape)
-            shape = tracked.constant["shape"]
+            cameras, tracked, own = _tracked(data, recorded, head, shape)
+            shape = own if shape is None else shape
+            if (difference := float(np.abs(own - shape).max())) > SAME_SHAPE:
+                others[name] = difference
         else:
             cameras, tracked = _untracked(calibration, recorded, head)
         folder = Path(os.path.abspath(out)) / f"{one.subject}_{name}_v{len(serials)}_whiteBg"
         jobs.append(SequenceJob(recorded, cameras, {}, {}, tracked, folder, on_white=True))
+    if others:
+        log.warning(
+            "%s: the tracking of %s has another shape of the head than that of %s, by up to %.3g; all get that of %s",
+            *(one.subject, some([*others]), names[0], max(others.values()), names[0]),
+        )
     union = jobs[0].folder.parent / f"UNION{len(jobs)}_{one.subject}_{track.name}"
     return PreparationPlan(one.subject, jobs, held_out, head, head.version, union, novel_views=())
 
 
+def _check_white(recorded: RecordedSequence) -> None:
+    """Warn if the first frame is not white outside of its alpha map: its colour would be left on soft edges."""
+    view = next(iter(recorded.views.values()))
+    frame = next(read_frames(view, recorded.numbers[:1]))
+    outside = frame.bgr[frame.mask == 0]
+    if len(outside) and (colour := np.median(outside, axis=0)).min() < WHITE_LEVEL:
+        found = "{2:.0f}, {1:.0f}, {0:.0f}".format(*colour)
+        why = (
+            "%s, frame %d: expected white outside of the alpha map, found RGB %s, which soft edges will keep"
+        )
+        log.warning(why, view.video, frame.number, found)
+
+
 def _tracked(
     data: Path, recorded: RecordedSequence, head: HeadArrays, shape: FloatArray | None
-) -> tuple[list[Camera], TrackedSequence]:
-    """Cameras and parameters of the frames that are kept."""
+) -> tuple[list[Camera], TrackedSequence, FloatArray]:
+    """Cameras and parameters of the frames that are kept, and the shape in the file, which ``shape`` replaces."""
     file = tracking_file(data, recorded.subject, recorded.name)
     sequence = read_tracked_sequence(data, MONO, recorded.subject, recorded.name, head, shape)
     count = max(view.count for view in recorded.views.values())
@@ -85,7 +116,8 @@ def _tracked(
     rows = [pose_to_parameters(sequence.poses[number]) for number in recorded.numbers]
     frames = {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
     cameras = [sequence.cameras[serial] for serial in recorded.views]
-    return cameras, TrackedSequence(file, frames, _constant(file, sequence.shape, head))
+    constant = _constant(file, sequence.shape if shape is None else shape, head)
+    return cameras, TrackedSequence(file, frames, constant), sequence.shape
 
 
 def _untracked(

@@ -23,6 +23,8 @@ from ...head.teeth import with_teeth_where_possible
 from ..recording import read_calibration
 from .submission import MEMBERS, MONO, BenchmarkTrack, tracking_file
 
+log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class SubmissionRenderSettings:
@@ -52,12 +54,12 @@ class SubmissionRenderSettings:
 
 MOST_SCALE = 1000.0
 EULER_TOLERANCE = 1e-3
-"""Maximum difference between entries of a rotation matrix in the file and from its angles."""
+"""Difference between entries of a rotation matrix in the file and from its angles that is not worth a warning."""
 
 
 @dataclass(frozen=True, eq=False)
 class BenchmarkSequence:
-    """A tracked sequence: cameras by serial, poses by timestep from 0, (S,) shape coefficients."""
+    """A tracked sequence: cameras by serial, poses by timestep from 0, (S,) shape coefficients of the file."""
 
     cameras: Mapping[str, Camera]
     poses: tuple[HeadPose, ...]
@@ -84,12 +86,11 @@ def read_sequence(
     rotations = Rotation.from_euler("XYZ", arrays["rotation"].astype(np.float64))
     off = float(np.abs(rotations.as_matrix() - arrays["rotation_matrices"]).max(initial=0.0))
     if off > EULER_TOLERANCE:
-        expected = "the matrices of the angles in rotation (intrinsic X, Y, Z)"
-        raise InputError(path, "rotation_matrices", expected, f"ones that differ by {off:.3g}")
-    if shape is None:
-        shape = _padded(path, "shape", arrays["shape"], head.shape_basis.shape[2])[0]
+        why = "%s, rotation_matrices: entries differ by up to %.3g from those of the angles in rotation, which are used"
+        log.warning(why, path, off)
+    own = _padded(path, "shape", arrays["shape"], head.shape_basis.shape[2])[0]
     expression = _padded(path, "expression", arrays["expression"], head.expression_basis.shape[2])
-    neutral = head.template + head.shape_basis @ shape
+    neutral = head.template + head.shape_basis @ (own if shape is None else shape)
     regressor = head.joint_regressor[0]
     roots = regressor @ neutral + np.einsum("v,vce,te->tc", regressor, head.expression_basis, expression)
     # scale (R x + t / scale) = scale (R (x - root) + root + t'), the outer scale being the cameras'.
@@ -116,7 +117,7 @@ def read_sequence(
             calibration.file, "world_2_cam", f"cameras {', '.join(track.serials)}", f"no {missing[0]}"
         )
     cameras = {serial: calibration.camera(serial, track.size, track.size) for serial in track.serials}
-    return BenchmarkSequence({s: _nearer(camera, scale) for s, camera in cameras.items()}, poses, shape)
+    return BenchmarkSequence({s: _nearer(camera, scale) for s, camera in cameras.items()}, poses, own)
 
 
 def _nearer(camera: Camera, scale: float) -> Camera:
@@ -135,8 +136,6 @@ def _padded(path: Path, name: str, values: FloatArray, size: int) -> FloatArray:
     return np.pad(values.astype(np.float64), ((0, 0), (0, size - values.shape[1])))
 
 
-log = logging.getLogger(__name__)
-
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -149,8 +148,9 @@ def render_participant(settings: SubmissionRenderSettings, progress: Progress = 
     stored = open_avatar(Path(settings.avatar), settings.method)
     folder, method = stored.folder, stored.method
     head = _head(folder, settings.head)
+    shape = stored.shape_of(head.version, head.shape_basis.shape[2])
     sequences = {
-        name: read_sequence(Path(settings.data), MONO, settings.participant, name, head)
+        name: read_sequence(Path(settings.data), MONO, settings.participant, name, head, shape)
         for name in MONO.sequences[settings.participant]
     }
     if not method.spec.resolution.native:

@@ -213,6 +213,22 @@ def test_videos_are_compared_frame_by_frame(videos, capsys, whole):
     assert all(row["jump"] for row in rows)
 
 
+@pytest.mark.parametrize("with_person", [True, False])
+def test_an_empty_frame_of_a_lossy_mask_is_empty(videos, capsys, with_person):
+    """It holds low levels of the codec, which are refused only where no frame has others."""
+    empty, inside = (np.dstack([levels] * 3) for levels in (np.full_like(INSIDE, 9), INSIDE))
+    write_browser_video(
+        Path("masks/clip.webm"), [empty] * 6 + [inside if with_person else empty] * 6, 25, "test"
+    )
+    words = [str(videos[0]), "--truth", str(videos[1]), "--masks", "masks/clip.webm", "--metrics", "psnr"]
+    if not with_person:
+        assert cli.main(["evaluate", *words]) == 2
+        assert re.search(r"masks/clip.webm: .* levels up to \d+", " ".join(capsys.readouterr().err.split()))
+        return
+    _, rows = evaluated(capsys, *words)
+    assert [bool(row["psnr/mask"]) for row in rows] == [False] * 6 + [True] * 6
+
+
 def test_videos_of_other_lengths_are_refused(videos, capsys):
     write_browser_video(videos[1], [picture() for _ in range(11)], 25, "test")
     assert cli.main(["evaluate", str(videos[0]), "--truth", str(videos[1])]) == 2

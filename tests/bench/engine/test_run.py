@@ -562,6 +562,21 @@ def test_metrics_of_one_measurement_are_taken_together_and_once(config, toy, mon
     assert len(counted) == 2
 
 
+def test_a_capture_that_holds_out_nothing_is_trained_on(config, toy, monkeypatch, caplog):
+    """Its avatars are measured with the poses of training frames."""
+    opened = toy.ToyClip.__init__
+
+    def without_tests(clip, path):
+        opened(clip, path)
+        clip.splits = {name: keys if name == "train" else () for name, keys in clip.splits.items()}
+
+    monkeypatch.setattr(toy.ToyClip, "__init__", without_tests)
+    rows = rows_of(config, metrics=("psnr", "toy_plugin:FILES_LOAD")).set_index(["subject", "metric"])
+    assert dict(rows["value"]) == {("subject1", "files_load"): 3.0, ("subject2", "files_load"): 3.0}
+    assert "Self-reenactment is missing: the captures hold out no frames" in caplog.text
+    assert cli.main(["verify", config.out, "--trust"]) == 0
+
+
 def test_a_metric_of_training_sees_the_record_of_the_fit(config, cell):
     assert rows_of(config, metrics=("toy_plugin:STEPS",))["value"].tolist() == [2.0, 2.0]
     measured = cell.record["details"]["steps"]

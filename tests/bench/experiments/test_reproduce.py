@@ -13,8 +13,12 @@ from pathlib import Path
 import pytest
 
 from headbench.bench import cli
+from headbench.bench.contracts import no_progress
 from headbench.bench.engine.config import resolve_cells
-from headbench.bench.experiments.forecast import Amounts, MethodRates, Rates, forecast
+from headbench.bench.engine.store import RunFolder
+from headbench.bench.errors import InputError
+from headbench.bench.experiments import reproduce
+from headbench.bench.experiments.forecast import Amounts, MethodRates, Rates, bytes_left, forecast
 from headbench.bench.experiments.reproduce import ReproduceSettings, planned_runs
 from headbench.bench.experiments.specs import MOVED_LINES
 from headbench.datasets.head.loaders import load_head
@@ -73,6 +77,42 @@ def test_amounts_are_those_of_the_recordings(tmp_path):
     assert [(job.count, job.tracked.count, job.folder.parent.name) for job in sample.jobs] == (
         [(2, 2, "sample")] * 2
     )
+
+
+def test_room_is_needed_for_what_is_not_there(tmp_path, monkeypatch):
+    """An earlier call has left captures; one more subject is refused, and nothing once all is written."""
+    recording = write_recording(tmp_path)
+    settings = replace(
+        SETTINGS,
+        data=str(recording.root),
+        tracking=str(recording.tracking),
+        head=str(recording.head),
+        out=str(tmp_path / "out"),
+        methods=("ga",),
+        subjects="901",
+        ablation="",
+        sequences="EMO-1,FREE",
+        downscale=2,
+        device="cpu",
+    )
+    runs, plans = planned_runs(settings), [plan_subject(settings.preparation("table-3"), "901")]
+    rates = Rates(0.5, 1e18, {"ga": MethodRates(2.0, 0.1, 1.0)})
+    monkeypatch.setattr(reproduce, "measure", lambda *_: rates)
+    (tmp_path / "out" / "captures").mkdir(parents=True)
+    amounts = Amounts.of(plans)
+    assert bytes_left(rates, runs, {"table-3": plans}) == amounts.images * 1e18 + amounts.frames
+    with pytest.raises(InputError, match="GB of free space"):
+        reproduce._plan(settings, runs, {"table-3": plans}, no_progress)
+    for job in plans[0].jobs:
+        for path in (job.image_path(t, i) for t in range(job.count) for i in range(len(job.cameras))):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+    assert bytes_left(rates, runs, {"table-3": plans}) == amounts.frames
+    reproduce._plan(settings, runs, {"table-3": plans}, no_progress)
+    cell = RunFolder(Path(runs["table-3"].out)).cell("901", "ga", 0)
+    cell.folder.mkdir(parents=True)
+    cell.rows.touch()
+    assert bytes_left(rates, runs, {"table-3": plans}) == 0
 
 
 def test_a_sequence_without_tracking_is_named_first(tmp_path, capsys):

@@ -1,6 +1,8 @@
 """Recordings that tests share, and copies that a test may damage."""
 
+import os
 import shutil
+import sys
 
 import pytest
 
@@ -34,3 +36,37 @@ def recording(pristine_recording, tmp_path) -> Recording:
 def videos(pristine_videos, tmp_path) -> Recording:
     """A copy of the videos that a test may damage."""
     return _copied(pristine_videos, tmp_path / "videos")
+
+
+FAKE = """#!{python}
+import sys
+sys.path[:] = {path!r}
+import cv2, numpy as np
+words = sys.argv[1:]
+open({log!r}, "w").write(" ".join(words))
+data = np.frombuffer(sys.stdin.buffer.read(), np.uint8)
+if {fails}:
+    sys.exit("no such encoder")
+width, height = map(int, words[words.index("-s") + 1].split("x"))
+rate = float(words[words.index("-r") + 1])
+writer = cv2.VideoWriter(words[-1], cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), rate, (width, height))
+for frame in data.reshape(-1, height, width, 3):
+    writer.write(frame[..., ::-1].copy())
+writer.release()
+"""
+
+
+@pytest.fixture
+def ffmpeg(tmp_path, monkeypatch):
+    """A program of that name that encodes by OpenCV, whose encoder of H.264 is not everywhere; it notes its words."""
+
+    def make(fails=False):
+        program = tmp_path / "bin" / "ffmpeg"
+        program.parent.mkdir(exist_ok=True)
+        log = tmp_path / "words"
+        program.write_text(FAKE.format(python=sys.executable, path=sys.path, log=str(log), fails=fails))
+        program.chmod(0o755)
+        monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
+        return log
+
+    return make

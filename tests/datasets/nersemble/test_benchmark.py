@@ -1,7 +1,6 @@
 """The NeRSemble benchmark: its tracking against its own formula, its zip against what its documentation says."""
 
 import json
-import os
 import re
 import sys
 import zipfile
@@ -47,11 +46,13 @@ def benchmark(head, tmp_path):
     return write_benchmark(tmp_path / "benchmark", head)
 
 
-def test_tracking_gives_the_benchmarks_meshes_and_pictures(head, benchmark):
+@pytest.mark.parametrize("shape", [None, np.linspace(-2, 2, 6)], ids=["of the file", "of an avatar"])
+def test_tracking_gives_the_benchmarks_meshes_and_pictures(head, benchmark, shape):
     """Its own formula: FLAME without rotation and translation, then scale, rotation, translation."""
-    sequence = read_sequence(benchmark, MONO, "393", "FREE", head)
+    sequence = read_sequence(benchmark, MONO, "393", "FREE", head, shape)
     arrays = dict(np.load(tracking_file(benchmark, "393", "FREE")))
-    subject = PosedSubject(head, sequence.shape, np.zeros_like(head.template))
+    own = sequence.shape if shape is None else shape
+    subject = PosedSubject(head, own, np.zeros_like(head.template))
     zero = np.zeros(3)
     still = subject.meshes([replace(pose, rotation=zero, translation=zero) for pose in sequence.poses])
     turned = np.einsum("tij,tvj->tvi", arrays["rotation_matrices"], still)
@@ -71,7 +72,6 @@ def test_tracking_gives_the_benchmarks_meshes_and_pictures(head, benchmark):
 
 
 BAD_TRACKING = {
-    "rotation_matrices": {"rotation": np.full((2, 3), 0.5, np.float32)},
     "expression": {"expression": np.zeros((2, 99), np.float32)},
     "scale": {"scale": np.zeros((1, 1), np.float32)},
     "jaw": {"jaw": np.zeros((3, 3), np.float32)},
@@ -85,6 +85,21 @@ def test_tracking_that_does_not_fit_is_refused(head, benchmark, key):
     np.savez(path, **(tracking(head, 2) | BAD_TRACKING[key]))
     with pytest.raises(InputError, match=key):
         read_sequence(benchmark, MONO, "393", "FREE", head)
+
+
+def test_matrices_that_differ_from_the_angles_are_not_used(head, benchmark, caplog):
+    """As the benchmark's own reader does; a warning names them."""
+    path = tracking_file(benchmark, "393", "FREE")
+    before = read_sequence(benchmark, MONO, "393", "FREE", head)
+    assert not caplog.messages
+    arrays = dict(np.load(path))
+    np.savez(path, **(arrays | {"rotation_matrices": np.eye(3, dtype=np.float32)[[[0, 1, 2], [1, 0, 2]]]}))
+    after = read_sequence(benchmark, MONO, "393", "FREE", head)
+    np.testing.assert_array_equal(
+        [pose.rotation for pose in after.poses], [pose.rotation for pose in before.poses]
+    )
+    (message,) = caplog.messages
+    assert f"{path}, rotation_matrices: entries differ by up to 1" in message
 
 
 def test_missing_cameras_and_version_1_are_refused(head, benchmark):
@@ -109,22 +124,6 @@ def test_files_are_those_of_the_documentation():
 
 
 SIZE, FRAMES = (32, 48), 3
-FAKE = """#!{python}
-import sys
-sys.path[:] = {path!r}
-import cv2, numpy as np
-words = sys.argv[1:]
-open({log!r}, "w").write(" ".join(words))
-data = np.frombuffer(sys.stdin.buffer.read(), np.uint8)
-if {fails}:
-    sys.exit("no such encoder")
-width, height = map(int, words[words.index("-s") + 1].split("x"))
-rate = float(words[words.index("-r") + 1])
-writer = cv2.VideoWriter(words[-1], cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), rate, (width, height))
-for frame in data.reshape(-1, height, width, 3):
-    writer.write(frame)  # grey
-writer.release()
-"""
 
 
 @pytest.fixture
@@ -139,22 +138,6 @@ def track(monkeypatch):
     )
     monkeypatch.setattr(submission, "TRACKS", {MONO.name: small})
     return small
-
-
-@pytest.fixture
-def ffmpeg(tmp_path, monkeypatch):
-    """A program of that name that encodes by OpenCV, whose encoder of H.264 is not everywhere; it notes its words."""
-
-    def make(fails=False):
-        program = tmp_path / "bin" / "ffmpeg"
-        program.parent.mkdir(exist_ok=True)
-        log = tmp_path / "words"
-        program.write_text(FAKE.format(python=sys.executable, path=sys.path, log=str(log), fails=fails))
-        program.chmod(0o755)
-        monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
-        return log
-
-    return make
 
 
 @pytest.fixture
@@ -270,10 +253,13 @@ def test_the_cost_of_the_codec_is_that_of_unrelated_errors():
 
 
 def test_an_avatar_renders_all_test_frames(benchmark, head, tmp_path, monkeypatch, capsys):
-    """Frames that the writer takes, of the size and names of the track; the pose tells them apart."""
+    """Frames that the writer takes, of the size and names of the track; the pose tells them apart, and is for the avatar's shape."""
     from headbench.datasets.nersemble.benchmark import render as module
 
+    places = []
+
     def shown(camera, pose, background):
+        places.append(pose.translation)
         level = 0.5 + 0.2 * np.tanh(5 * pose.rotation[0])
         return Frame(np.full((camera.height, camera.width, 3), level, np.float32), np.ones((512, 512)))
 
@@ -295,9 +281,14 @@ def test_an_avatar_renders_all_test_frames(benchmark, head, tmp_path, monkeypatc
     assert files[0].name == "EMO-1-shout+laugh_00000_220700191.png"
     assert len({path.read_bytes() for path in files}) > 4
     assert "another shape" not in capsys.readouterr().err
-    record |= {"subject": "074", "head_model": head.version, "shape": [9.0, 9.0, 9.0]}
+    record |= {"subject": "074", "head_model": head.version, "shape": [9.0] * 6}
+    before, places[:] = np.array(places), []
     assert cli.main(words) == 0
     assert "shows 074, with another shape than 393" in capsys.readouterr().err
+    last = [*MONO.sequences["393"]][-1]
+    for shape, found in ((None, before), (np.full(6, 9.0), places)):
+        (*_, pose) = read_sequence(benchmark, MONO, "393", last, head, shape).poses
+        np.testing.assert_array_equal(found[-1], pose.translation)
     assert cli.main([*words[:5], "--participant", "074", "--out", str(tmp_path / "o")]) == 2
     method.spec = replace(spec, resolution=ResolutionRule(size=(1024, 1024)))
     assert cli.main([*words[:-1], str(tmp_path / "larger")]) == 2

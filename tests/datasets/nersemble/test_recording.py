@@ -190,6 +190,13 @@ def test_other_shapes_and_opposite_cameras_are_refused(file):
         read_calibration(write(file, world_2_cam=opposite)).aligned()
 
 
+def test_only_cameras_that_are_used_need_intrinsics(file):
+    calibration = read_calibration(write(file, intrinsics={"222200042": K}, width=None, height=None))
+    assert calibration.camera("222200042", (48, 64), (48, 64)).K.tolist() == K
+    with pytest.raises(InputError, match="intrinsics: expected a matrix for camera 222200037, found none"):
+        calibration.camera("222200037", (48, 64), (48, 64))
+
+
 MATRIX = np.eye(4).tolist()
 K = [[100.0, 0, 24], [0, 100, 32], [0, 0, 1]]
 
@@ -208,7 +215,6 @@ K = [[100.0, 0, 24], [0, 100, 32], [0, 0, 1]]
         ({"intrinsics": (-np.array(K)).tolist()}, "intrinsics"),
         ({"intrinsics": [[100.0, 5, 24], *K[1:]]}, "intrinsics"),
         ({"intrinsics": [[float("nan"), 0, 24], *K[1:]]}, "intrinsics[0][0]"),
-        ({"intrinsics": {"222200042": K}}, "intrinsics"),
         ({"height": 0}, "height"),
         ({"width": None}, "width"),
         ({"width": True}, "width"),
