@@ -84,11 +84,13 @@ def training_processor(record: Mapping[str, Any]) -> Measurement:
 def training_iterations(record: Mapping[str, Any]) -> Measurement:
     """Iterations in the budget of the training.
 
-    Raises `UnavailableError` for a budget in seconds only.
+    Raises `UnavailableError` for a budget with a limit in seconds.
     """
     budget = record.get("method", {}).get("budget", {})
-    if budget.get("iterations") is None:
-        raise UnavailableError("The budget was in seconds.", "Name iterations for their number.")
+    if budget.get("iterations") is None or budget.get("seconds") is not None:
+        raise UnavailableError(
+            "The budget was limited in seconds.", "Limit iterations alone for their number."
+        )
     return Measurement(float(budget["iterations"]), {})
 
 

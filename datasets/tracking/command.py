@@ -44,8 +44,7 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
     """Track the head model of a capture in its images, without using its tracking.
 
     Writes under ``settings.out`` the capture (images linked), ``track.json`` with every timestep's residuals and
-    ``overlay.png``. Intermediate results are stored there, so that an interrupted call can be resumed; a call that refuses its
-    input removes those that it made.
+    ``overlay.png``. Intermediate results are stored there, so that an interrupted call can be resumed.
     """
     if settings.fetch_networks:
         files = fetch_networks()
@@ -55,20 +54,12 @@ def track_capture(settings: TrackSettings, progress: Progress = no_progress) -> 
         from .programs import track_with_program
 
         return track_with_program(settings, progress)
-    work = Path(settings.out, WORK)
+    out = Path(settings.out)
+    work = out / WORK
     check_work_folder(work)
     if is_video(Path(settings.capture)):
         interpreter_class()  # refuses before any slow import
-    resumed = work.exists()
-    try:
-        return _track(settings, work, progress)
-    except InputError:
-        if not resumed:
-            shutil.rmtree(work, ignore_errors=True)
-        raise
 
-
-def _track(settings: TrackSettings, work: Path, progress: Progress) -> CommandResult:
     from ..clip import check_apart
     from ..ga.writer import capture_plan, write_capture
     from ..images import write_image
@@ -78,7 +69,6 @@ def _track(settings: TrackSettings, work: Path, progress: Progress) -> CommandRe
     from .landmarks import landmark_source
     from .track import LandmarkSource, check_cameras, track, tracking_errors
 
-    out = work.parent
     used = {name: value for name, value in asdict(settings).items() if name not in ("out", "against")}
     _check_same_settings(out / REPORT, used)
     if is_video(Path(settings.capture)):

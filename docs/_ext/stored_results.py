@@ -28,7 +28,7 @@ from headbench.bench.progress import counted
 from headbench.bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
 from headbench.bench.registry import discover, get
 from headbench.bench.rows import FULL, Rows
-from headbench.reports.aggregate import coded_labels, summarise
+from headbench.reports.aggregate import summarise
 from headbench.reports.curve.curve import HELD_OUT, CurveData, CurvePoint, leaders_text, read_curve
 from headbench.reports.papers import papers
 from headbench.reports.protocols import choice_effects
@@ -357,23 +357,23 @@ def curve_cell(point: CurvePoint, curve: CurveData) -> str:
 
 def sizes(runs: Mapping[str, RunSet]) -> str:
     """PSNR of the face, bytes of trained and coded avatars, and ms a frame, by maximum number of splats."""
-    heads = ["Splats", "Method", *(f"{TASK_TITLES[task]}, face (dB)" for task in (NOVEL, UNSEEN_CAMERAS))]
-    heads += ["coded: novel view, face (dB)", "MB", "coded MB", "ms a frame"]
+    heads = [
+        "Most splats",
+        "Method",
+        "splats",
+        *(f"{TASK_TITLES[task]}, face (dB)" for task in (NOVEL, UNSEEN_CAMERAS)),
+    ]
+    heads += ["MB", "coded MB", "change by coding (dB)", "ms a frame"]
     lines = [heads, ["---", "---", *["--:"] * (len(heads) - 2)]]
-    for splats, read in sorted(runs.items(), key=lambda item: float(item[0])):
+    for thousands, read in sorted(runs.items(), key=lambda item: float(item[0])):
         each = read.by_camera
-        face, coded = each.of(FrameSelection(FACE)).rows, coded_labels(each.runs[0].manifest)
+        face = each.of(FrameSelection(FACE)).rows
         for name in each.ranked:
-            small = coded[name]
-            values = [
-                *(summarise(face, name, "psnr", task) for task in (NOVEL, UNSEEN_CAMERAS)),
-                summarise(face, small, "psnr", NOVEL),
-                *(summarise(each.rows, label, "storage", "") for label in (name, small)),
-                summarise(each.rows, name, "latency_p50", ""),
-            ]
-            digits = (1, 1, 1, 2, 2, 0)
-            cells = [f"{v.value:.{n}f}" for v, n in zip(values, digits, strict=True)]
-            lines.append([f"{splats},000", f"`{name}`", *cells])
+            metrics = {"storage": 2, "storage_coded": 2, "coded_change": 2, "latency_p50": 0}
+            cells = [f"{summarise(face, name, 'psnr', task).value:.1f}" for task in (NOVEL, UNSEEN_CAMERAS)]
+            cells += [f"{summarise(each.rows, name, m, '').value:.{n}f}" for m, n in metrics.items()]
+            count = f"{summarise(each.rows, name, 'primitives', '').value:,.0f}"
+            lines.append([f"{thousands},000", f"`{name}`", count, *cells])
     return pipe_table(lines)
 
 

@@ -23,8 +23,12 @@ def test_time_in_minutes_and_memory_in_si_gigabytes():
 def test_processor_time_and_iterations_are_those_of_the_record():
     assert training_processor(RECORD).value == 280.5
     assert training_iterations(RECORD).value == 4000
+
+
+@pytest.mark.parametrize("iterations", [None, 100_000])
+def test_a_limit_of_seconds_leaves_iterations_unknown(iterations):
     with pytest.raises(UnavailableError, match="in seconds"):
-        training_iterations({"method": {"budget": {"iterations": None, "seconds": 60.0}}})
+        training_iterations({"method": {"budget": {"iterations": iterations, "seconds": 60.0}}})
 
 
 def test_an_interrupted_training_has_no_time_but_a_memory():
