@@ -33,6 +33,7 @@ from headbench.reports.curve.curve import HELD_OUT, CurveData, CurvePoint, leade
 from headbench.reports.papers import papers
 from headbench.reports.protocols import choice_effects
 from headbench.reports.runs import FrameSelection, RunData, RunSet
+from headbench.reports.statistics.comparisons import LEAST_SUBJECTS
 from headbench.reports.suite.suite import (
     FOLDER,
     comparison,
@@ -183,12 +184,15 @@ def findings(suite: RunSet, curve: CurveData, both: CurveData) -> str:
     )
     planned = planned_subjects(suite)
     interim = f"; interim, {planned} are planned" if novel.subjects < planned else ""
+    over = f"means over {counted(novel.subjects, 'subject')}" + " with 95 % intervals" * (
+        novel.subjects >= LEAST_SUBJECTS
+    )
     longest = max(point.cost[curve.clock] or 0.0 for point in curve.means)
     after = [best_at(curve, seconds) for seconds in (60.0, longest)]
     crossing = "; ".join(each.text() for each in both.best[f"psnr_{FACE}", NOVEL])
     return f"""\
 - In the face at cameras without training images, `{OURS}` minus `{REFERENCE}` is {novel.text(1)} dB in novel views and {new.text(1)} dB \
-in new expressions (means over {counted(novel.subjects, "subject")} with 95 % intervals{interim}), with about {fmean(trainings):.0f} processor seconds of training.
+in new expressions ({over}{interim}), with about {fmean(trainings):.0f} processor seconds of training.
 - Lines that move splats (`{MOVED}`) instead of changing their opacity change novel views by {novel_moved.text(1)} dB and new \
 expressions by {new_moved.text(1)} dB in the face; in Table 4 of the paper of `{OURS}` by +1.2 and -0.7 dB.
 - With one minute of training on one processor the best face is that of {after[0]}, with {longest / 60:.0f} minutes that of {after[1]} \
@@ -439,8 +443,9 @@ def store(run: Path, target: Path) -> None:
 def main(what: str, out: Path, root: Path) -> None:
     """Store the runs in a folder, write all blocks, and draw pictures of these runs."""
     stored, place = StoredResults(root), "" if what == "demo" else what
-    for found in sorted(out.rglob("run.json")):
-        store(found.parent, stored.gallery / place / found.parent.relative_to(out))
+    for run in sorted(found.parent for found in out.rglob("run.json")):
+        if run.name != FOLDER:  # of extremes, whose record is stored with the run
+            store(run, stored.gallery / place / run.relative_to(out))
     stored.write()
     if what == "curves":
         readme_pictures.draw_curves(stored.curve(), root / "docs" / "pictures")
