@@ -189,15 +189,16 @@ def findings(suite: RunSet, curve: CurveData, both: CurveData) -> str:
     )
     longest = max(point.cost[curve.clock] or 0.0 for point in curve.means)
     after = [best_at(curve, seconds) for seconds in (60.0, longest)]
+    also = "too" if after[0] == after[1] else f"that of {after[1]}"
     crossing = "; ".join(each.text() for each in both.best[f"psnr_{FACE}", NOVEL])
     return f"""\
 - In the face at cameras without training images, `{OURS}` minus `{REFERENCE}` is {novel.text(1)} dB in novel views and {new.text(1)} dB \
 in new expressions ({over}{interim}), with about {fmean(trainings):.0f} processor seconds of training.
 - Lines that move splats (`{MOVED}`) instead of changing their opacity change novel views by {novel_moved.text(1)} dB and new \
 expressions by {new_moved.text(1)} dB in the face; in Table 4 of the paper of `{OURS}` by +1.2 and -0.7 dB.
-- With one minute of training on one processor the best face is that of {after[0]}, with {longest / 60:.0f} minutes that of {after[1]} \
-({counted(len(curve.subjects), "development subject")}, at most 20,000 splats; longer trainings are not measured). The better one of \
-`{OURS}` and `{REFERENCE}` in novel views, by processor seconds: {crossing}."""
+- After one minute of training on one processor the best face is that of {after[0]}, after {longest / 60:.0f} minutes {also} \
+({counted(len(curve.subjects), "development subject")}, at most 20,000 splats; longer trainings are not measured). Of \
+`{OURS}` and `{REFERENCE}`, by seconds, in novel views: {crossing}."""
 
 
 SPOKEN = {

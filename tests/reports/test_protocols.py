@@ -126,7 +126,7 @@ def test_missing_sequences_and_tasks_are_refused(runs):
 
 def test_differences_from_the_published_conditions_are_said(runs):
     text = table_text([GALLERY], "md", protocol="suite")
-    assert "Pixels: 120x174; in the protocol: 275x401." in text
+    assert "Pixels: 120x174; in the protocol: 144x208." in text
     assert "Mean over frames, then sequences, then subjects" in text
     assert "Mean over frames, then subjects" in table_text([GALLERY], "md", protocol="mogaface-2026")
     assert "fitted to" not in text
