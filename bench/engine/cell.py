@@ -62,7 +62,7 @@ def kept_rows(job: Job, metrics: Sequence[MetricSpec]) -> Rows | None:
     rows = stored_rows(job) if job.is_measured(metrics) else None
     if rows is None:
         return None
-    if job.cell.is_trained:
+    if job.source is None and job.cell.is_trained:
         log.info("%s: kept: trained %s", job.name, trained_ago(job.cell.record))
     return rows.of_metrics([spec.name for spec in metrics])
 
