@@ -128,6 +128,11 @@ def _rates(folder: RunFolder, subject: str, method: str, timed: int) -> MethodRa
     return MethodRates(iteration, scored / len(renders), size / len(renders))
 
 
+def runs_of(part: str, runs: Mapping[str, RunConfig]) -> dict[str, RunConfig]:
+    """The runs of a part, with whose name theirs begin."""
+    return {name: config for name, config in runs.items() if name.startswith(part)}
+
+
 def bytes_left(
     rates: Rates, runs: Mapping[str, RunConfig], recordings: Mapping[str, Sequence[PreparationPlan]]
 ) -> float:
@@ -138,7 +143,7 @@ def bytes_left(
     for part, plans in recordings.items():
         for job in (job for plan in plans for job in plan.jobs):
             size += (job.count * len(job.cameras) - count_images(job)) * rates.image_bytes
-        for config in (config for name, config in runs.items() if name.startswith(part)):
+        for config in runs_of(part, runs).values():
             for plan, (method, condition), seed in product(plans, resolve_cells(config), config.seeds):
                 label = label_of(method.spec.name, condition.name)
                 cell = RunFolder(Path(config.out)).cell(plan.subject, label, seed)
@@ -151,15 +156,13 @@ def bytes_left(
 def forecast(rates: Rates, runs: Mapping[str, RunConfig], amounts: Mapping[str, Amounts]) -> dict[str, Any]:
     """Hours and GB of each step and in all, and a table of them.
 
-    ``amounts`` are those of each part; the name of a run begins with that of its part.
+    ``amounts`` are those of each part.
     """
     steps: list[tuple[str, str, int, float | None, float]] = []
     for part, amount in amounts.items():
         size = amount.images * rates.image_bytes
         steps.append((part, "images of captures", amount.images, rates.image_s, size))
-        for name, config in runs.items():
-            if not name.startswith(part):
-                continue
+        for name, config in runs_of(part, runs).items():
             for method, condition in resolve_cells(config):
                 each, label = rates.methods[method.spec.name], label_of(method.spec.name, condition.name)
                 if method.budget.iterations:

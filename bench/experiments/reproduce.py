@@ -25,7 +25,7 @@ from ..options import iterations
 from ..protocol import needed
 from ..registry import get
 from ..specs import CommandResult, MethodSpec, command
-from .forecast import TIMESTEPS, Amounts, Rates, bytes_left, forecast, measure
+from .forecast import TIMESTEPS, Amounts, Rates, bytes_left, forecast, measure, runs_of
 from .specs import MOVED_LINES
 
 if TYPE_CHECKING:
@@ -288,7 +288,7 @@ def _write_claims(settings: ReproduceSettings, runs: Mapping[str, RunConfig]) ->
 
     paper, finished = paper_named(settings.paper), {}
     for part in settings.parts:
-        folders = [Path(config.out) for name, config in runs.items() if name.startswith(part)]
+        folders = [Path(config.out) for config in runs_of(part, runs).values()]
         folders = [folder for folder in folders if RunFolder(folder).rows.exists()]
         if folders:
             read = RunSet.read(folders)

@@ -7,7 +7,7 @@ from PIL import Image
 from headbench.bench.progress import counted
 from headbench.bench.protocol import SEEN_CAMERAS, UNSEEN_CAMERAS, evenly
 from headbench.reports.contact_sheet import compared_frame, contact_sheet
-from headbench.reports.curve.curve import HELD_OUT, CurveData, CurvePoint, write_curve
+from headbench.reports.curve.curve import HELD_OUT, CurveData, write_curve
 from headbench.reports.drawing import cost_axis, plot_file, start_axes
 from headbench.reports.runs import SPLIT_TASK, RunData, unseen_cameras
 from headbench.reports.suite.suite import suite_runs
@@ -38,10 +38,7 @@ def draw_subjects(suite: Path, path: Path) -> None:
 def draw_curves(curve: CurveData, folder: Path) -> None:
     """Draw the curves over training time, and the README's plot: PSNR of the face over processor seconds, with sizes."""
     write_curve(folder / "curves.png", curve)
-    lines: dict[str, list[CurvePoint]] = {}
-    for point in curve.means:
-        lines.setdefault(point.method, []).append(point)
-    sizes = [point.values["storage"] for own in lines.values() for point in own]
+    lines, sizes = curve.by_method, [point.values["storage"] for point in curve.means]
     note = (
         f"Means over {counted(len(curve.subjects), 'development subject')}. Area of a circle: size of the avatar, {min(sizes):.1f} to "
         f"{max(sizes):.1f} MB."

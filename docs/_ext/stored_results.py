@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import groupby, product
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -41,7 +41,6 @@ from headbench.reports.suite.suite import (
     planned_subjects,
     primary_table,
     read_extremes,
-    suite_runs,
 )
 from headbench.reports.table_report import Columns, table_of
 from headbench.reports.tables import build_table
@@ -75,26 +74,22 @@ class StoredResults:
         self.run = cache(RunData.read)
         self.read = cache(lambda *folders: RunSet.joined(tuple(map(self.run, folders))))
         self.curve = cache(
-            lambda *methods: read_curve([*map(self.run, self.inside("curves"))], "budget", methods)
+            lambda *methods: read_curve([*map(self.run, self.runs("curves"))], "budget", methods)
         )
 
-    def runs(self, *place: str) -> list[Path]:
-        """Folders of the stored runs of one kind."""
-        return suite_runs(self.gallery.joinpath(*place[:-1]), place[-1])
-
-    def inside(self, name: str) -> list[Path]:
+    def runs(self, name: str) -> list[Path]:
         """Folders of all stored runs in a folder of the gallery, at any depth."""
         return sorted(file.parent for file in (self.gallery / name).rglob("run.json"))
 
     @property
     def suite(self) -> RunSet:
         """The runs of the suite on exact captures."""
-        return self.read(*self.runs("suite", RUN))
+        return self.read(*self.runs(f"suite/{RUN}"))
 
     @property
     def recorded(self) -> RunSet:
         """The runs of the suite on captures as recordings are."""
-        return self.read(*self.runs("suite", RECORDED_RUN))
+        return self.read(*self.runs(f"suite/{RECORDED_RUN}"))
 
     def blocks(self) -> dict[tuple[str, str], str]:
         """Every block by its page and name."""
@@ -118,10 +113,8 @@ class StoredResults:
             (f"{DOCS}/results.md", "exact"): psnr_differences(self.suite, BESIDE, REFERENCE, (FACE,)),
             (f"{DOCS}/results.md", "table-4"): moved_lines(self.recorded, self.suite),
             (f"{DOCS}/results.md", "curves"): curve_table(self.curve(*CURVED), self.curve(OURS, REFERENCE)),
-            (f"{DOCS}/results.md", "sizes"): sizes(
-                {run.name: self.read(run) for run in self.inside("sizes")}
-            ),
-            (f"{DOCS}/results.md", "extremes"): extremes(read_extremes(self.runs("suite", RUN))),
+            (f"{DOCS}/results.md", "sizes"): sizes({run.name: self.read(run) for run in self.runs("sizes")}),
+            (f"{DOCS}/results.md", "extremes"): extremes(read_extremes(self.runs(f"suite/{RUN}"))),
             (f"{DOCS}/protocols.md", "protocols"): choices(self.recorded),
             (f"{DOCS}/protocols.md", "profiles"): choices(profiles, "the third suite"),
             (f"{DOCS}/metrics.md", "faces"): to_markdown(table_of(faces)).strip(),
@@ -343,14 +336,14 @@ def curve_table(curve: CurveData, pair: CurveData) -> str:
     """PSNR of the face and processor seconds by method and length of training, and the best methods, of all and of a pair."""
     parts = sorted({point.part for point in curve.means})
     lines = [["Method", *(f"{part} of the longest" for part in parts)], ["---", *["---"] * len(parts)]]
-    for method, points in groupby(curve.means, key=lambda point: point.method):
+    for method, points in curve.by_method.items():
         cells = {point.part: curve_cell(point, curve) for point in points}
         lines.append([f"`{method}`", *(cells.get(part, "ended") for part in parts)])
     kinds = " / ".join(TASK_TITLES[task].lower() for task in curve.tasks)
     head = f"PSNR of the face in dB, {kinds}, and processor seconds of the training; means over {counted(len(curve.subjects), 'subject')}:"
     of_face = [spec for spec in curve.metrics if spec.name == f"psnr_{FACE}"]
     led = [leaders_text(replace(each, metrics=of_face)) for each in (curve, pair)]
-    names = " and ".join(f"`{name}`" for name in dict.fromkeys(point.method for point in pair.means))
+    names = " and ".join(f"`{name}`" for name in pair.by_method)
     return "\n\n".join([head, pipe_table(lines), led[0], f"Of {names} alone:", led[1].partition("\n\n")[2]])
 
 

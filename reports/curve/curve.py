@@ -336,12 +336,11 @@ def _parts(curve: Path) -> list[Path]:
 def rising(parts: Sequence[Path], over: str) -> set[str]:
     """Methods whose curve has not ended at its last training, see `ended`."""
     curve = read_curve([RunData.read(part) for part in parts], over)
-    points: dict[str, list[CurvePoint]] = {}
-    for point in curve.means:
-        points.setdefault(point.method, []).append(point)
     psnr = next(name for name in ("psnr_face", "psnr") if any(spec.name == name for spec in curve.metrics))
     seen = HELD_OUT[next(task for task in curve.tasks if task != "novel_view")]
-    return {name for name, own in points.items() if not ended(own, f"{psnr}_{seen}", f"{psnr}_camera")}
+    return {
+        name for name, own in curve.by_method.items() if not ended(own, f"{psnr}_{seen}", f"{psnr}_camera")
+    }
 
 
 def ended(points: Sequence[CurvePoint], seen: str, unseen: str) -> bool:
@@ -401,6 +400,14 @@ class CurveData:
     every: int  # one of this many consecutive training timesteps is held out; 0 if test frames were scored
     held_out: Mapping[str, Mapping[str, Any]]  # camera and timesteps, and remaining training data, by subject
     missing: Mapping[str, str]  # reasons by label of a metric that was not measured
+
+    @property
+    def by_method(self) -> dict[str, list[CurvePoint]]:
+        """The means of each method, by increasing quantity."""
+        points: dict[str, list[CurvePoint]] = {}
+        for point in self.means:
+            points.setdefault(point.method, []).append(point)
+        return points
 
     @property
     def of_test(self) -> bool:
