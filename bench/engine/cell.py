@@ -49,6 +49,7 @@ def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
     If the cell's condition animates the avatar, that change replaces the last two stages.
     """
     if (rows := kept_rows(job, metrics)) is not None:
+        log_kept(job)
         return rows
     avatar = train(job) if job.source is None else derive(job)
     if job.condition.drive:
@@ -60,11 +61,13 @@ def run_cell(job: Job, metrics: Sequence[MetricSpec]) -> Rows:
 def kept_rows(job: Job, metrics: Sequence[MetricSpec]) -> Rows | None:
     """Rows of these metrics if all are measured, else None."""
     rows = stored_rows(job) if job.is_measured(metrics) else None
-    if rows is None:
-        return None
+    return None if rows is None else rows.of_metrics([spec.name for spec in metrics])
+
+
+def log_kept(job: Job) -> None:
+    """Say that the avatar of a cell is one of an earlier start."""
     if job.source is None and job.cell.is_trained:
         log.info("%s: kept: trained %s", job.name, trained_ago(job.cell.record))
-    return rows.of_metrics([spec.name for spec in metrics])
 
 
 def stored_rows(job: Job) -> Rows | None:
@@ -91,7 +94,7 @@ def train(job: Job) -> Avatar:
     """
     method, cell, record = job.create(), job.cell, job.cell.record
     if record.get("state") == "trained":
-        log.info("%s: kept: trained %s", job.name, trained_ago(record))
+        log_kept(job)
         return job.load()
     if "state" not in record and cell.avatar.exists():
         remedy = f"Delete {cell.folder}; the same command makes it again."

@@ -37,7 +37,7 @@ from ..registry import discover, get, resolve
 from ..rows import Rows
 from ..specs import MAX_LABEL, DatasetSpec, MetricSpec
 from .captures import located, open_clips
-from .cell import failed_rows, kept_rows, run_cell
+from .cell import failed_rows, kept_rows, log_kept, run_cell
 from .config import ResolvedMethod, RunConfig, resolve_cells, resolve_metrics
 from .plan import Job, Plan, make_jobs, make_plan
 from .scoring import compared_over_time, make_metric
@@ -275,6 +275,9 @@ def execute(plan: Plan, execution: Execution) -> list[Rows]:
     places = {task.place: job for task, job in zip(tasks, jobs)}
     steady = [metric for metric in metrics if not metric.is_speed]
     failures: dict[str, str] = {}
+    for job in jobs:
+        if job.is_measured(metrics):
+            log_kept(job)
     schedule = Schedule(
         "avatars trained and measured", lambda task: places[task.place].is_measured(steady), execution
     )

@@ -103,7 +103,8 @@ def test_a_full_disk_ends_the_run_and_no_cell_is_failed(config):
 def test_kept_cells_are_named_and_changed_code_fails_others(config, rows_of, caplog):
     caplog.set_level("INFO", logger="headbench")
     config = replace(config, methods=("toy_plugin:METHOD",))
-    rows_of(config)
+    rows_of(config, TWO)
+    assert "kept: trained" not in caplog.text
     folder = RunFolder(Path(config.out))
     own = folder.read_manifest().machine
     for subject, processor in (("subject1", "A"), ("subject2", "B")):
