@@ -53,6 +53,8 @@ BESIDE = (OURS, MOVED, "ours-plus", "gbs")
 """Methods of the results page's differences from `REFERENCE`."""
 CURVED = (REFERENCE, "gbs", OURS, "ours-plus")
 """Methods with a curve on every development subject."""
+FIRST = "900"
+"""The development subject on which all methods have a curve."""
 COLUMNS = (
     ("Face PSNR, novel views (dB) ↑", FACE, "psnr", NOVEL, 1),
     ("Face PSNR, new expressions (dB) ↑", FACE, "psnr", UNSEEN_CAMERAS, 1),
@@ -74,7 +76,7 @@ class StoredResults:
         self.run = cache(RunData.read)
         self.read = cache(lambda *folders: RunSet.joined(tuple(map(self.run, folders))))
         self.curve = cache(
-            lambda *methods: read_curve([*map(self.run, self.runs("curves"))], "budget", methods)
+            lambda *methods, of="": read_curve([*map(self.run, self.runs(f"curves/{of}"))], "budget", methods)
         )
 
     def runs(self, name: str) -> list[Path]:
@@ -113,6 +115,7 @@ class StoredResults:
             (f"{DOCS}/results.md", "exact"): psnr_differences(self.suite, BESIDE, REFERENCE, (FACE,)),
             (f"{DOCS}/results.md", "table-4"): moved_lines(self.recorded, self.suite),
             (f"{DOCS}/results.md", "curves"): curve_table(self.curve(*CURVED), self.curve(OURS, REFERENCE)),
+            (f"{DOCS}/results.md", "further-curves"): trainings(self.curve(of=FIRST)),
             (f"{DOCS}/results.md", "sizes"): sizes({run.name: self.read(run) for run in self.runs("sizes")}),
             (f"{DOCS}/results.md", "extremes"): extremes(read_extremes(self.runs(f"suite/{RUN}"))),
             (f"{DOCS}/protocols.md", "protocols"): choices(self.recorded),
@@ -333,18 +336,24 @@ def choices(runs: RunSet, suite: str = "the suite") -> str:
 
 
 def curve_table(curve: CurveData, pair: CurveData) -> str:
-    """PSNR of the face and processor seconds by method and length of training, and the best methods, of all and of a pair."""
+    """`trainings` of a curve, and the best methods, of all and of a pair."""
+    of_face = [spec for spec in curve.metrics if spec.name == f"psnr_{FACE}"]
+    led = [leaders_text(replace(each, metrics=of_face)) for each in (curve, pair)]
+    names = " and ".join(f"`{name}`" for name in pair.by_method)
+    return "\n\n".join([trainings(curve), led[0], f"Of {names} alone:", led[1].partition("\n\n")[2]])
+
+
+def trainings(curve: CurveData) -> str:
+    """PSNR of the face and processor seconds by method and length of training."""
     parts = sorted({point.part for point in curve.means})
     lines = [["Method", *(f"{part} of the longest" for part in parts)], ["---", *["---"] * len(parts)]]
     for method, points in curve.by_method.items():
         cells = {point.part: curve_cell(point, curve) for point in points}
         lines.append([f"`{method}`", *(cells.get(part, "ended") for part in parts)])
     kinds = " / ".join(TASK_TITLES[task].lower() for task in curve.tasks)
-    head = f"PSNR of the face in dB, {kinds}, and processor seconds of the training; means over {counted(len(curve.subjects), 'subject')}:"
-    of_face = [spec for spec in curve.metrics if spec.name == f"psnr_{FACE}"]
-    led = [leaders_text(replace(each, metrics=of_face)) for each in (curve, pair)]
-    names = " and ".join(f"`{name}`" for name in pair.by_method)
-    return "\n\n".join([head, pipe_table(lines), led[0], f"Of {names} alone:", led[1].partition("\n\n")[2]])
+    over = counted(len(curve.subjects), "subject")
+    head = f"PSNR of the face in dB, {kinds}, and processor seconds of the training; means over {over}:"
+    return f"{head}\n\n{pipe_table(lines)}"
 
 
 def curve_cell(point: CurvePoint, curve: CurveData) -> str:
@@ -442,7 +451,7 @@ def main(what: str, out: Path, root: Path) -> None:
             store(run, stored.gallery / place / run.relative_to(out))
     stored.write()
     if what == "curves":
-        readme_pictures.draw_curves(stored.curve(), root / "docs" / "pictures")
+        readme_pictures.draw_curves(stored.curve(*CURVED), root / "docs" / "pictures")
     if what == "suite":
         readme_pictures.draw_subjects(out, stored.gallery / "subjects.jpg")
 
