@@ -66,7 +66,8 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]], entry: str =
     if entry and isinstance(content, dict):
         content = content.get(entry)
     if not isinstance(content, dict):
-        raise InputError(path, entry, "a dictionary of tensors", type(content).__name__)
+        found = "no such entry" if content is None else type(content).__name__
+        raise InputError(path, entry, "a dictionary of tensors", found)
     return {name: _tensor(path, name, content.get(name), shape) for name, shape in shapes.items()}
 
 

@@ -20,7 +20,7 @@ from ..engine.config import default_names
 from ..engine.scoring import FACE, Score, ScoredFrames, score_frames
 from ..errors import InputError
 from ..io.files import check_writable, entries, natural_order, write_text
-from ..io.images import probe_image, read_pixels, read_png
+from ..io.images import UPRIGHT, orientation_of, probe_image, read_pixels, read_png
 from ..io.videos import SUFFIXES, video_frames
 from ..machine import processor_count
 from ..progress import counted, some
@@ -149,6 +149,9 @@ def _extent(path: Path) -> Extent:
     if info.has_alpha and read_pixels(path)[..., 3].min() < 255:
         remedy = "Composite it on the background of the other image."
         raise InputError(path, "alpha", "an opaque image", "transparent pixels", remedy)
+    if info.format == "JPEG" and (orientation := orientation_of(path)) not in (0, UPRIGHT):
+        remedy = "Save it upright, without the tag, which is not applied."
+        raise InputError(path, "EXIF", "pixels stored upright", f"orientation {orientation}", remedy)
     return Extent(info.width, info.height, None)
 
 
@@ -304,7 +307,11 @@ def score_pairs(
     progress: Progress,
 ) -> CommandResult:
     """Score two folders or two videos; write a CSV file with a row for each pair to ``out``."""
+    if renders.resolve() == truth.resolve():
+        raise InputError("command line", "--truth", "another folder or file than the renders", str(truth))
     if out is not None:
+        if out.suffix.lower() in (*IMAGES, *SUFFIXES):
+            raise InputError("command line", "--out", "a CSV file to write", str(out))
         check_writable(out, "--out")
     protocol = _protocol(protocols, metrics)
     specs = pair_metrics(metrics or (protocol.compared if protocol else ()), masks=masks is not None)
@@ -312,7 +319,9 @@ def score_pairs(
     images = PairedImages(pairs, resize)
     regions = (MASK,) if masks is not None else ()
     keys = [pair.key for pair in pairs]
-    scored = score_frames(keys, ScoredFrames(images.render, images), specs, regions, progress, device)
+    frames = ScoredFrames(images.render, images)
+    score_frames(keys[:1], frames, specs, device=device)  # finds wrong files of networks before long work
+    scored = score_frames(keys, frames, specs, regions, progress, device)
     columns = [
         _Column(spec, region, {s.key: s for s in scored[spec.name] if s.region == region})
         for spec in specs

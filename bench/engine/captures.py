@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_type_hints
 from ..condition import Named
 from ..configuration import build_arguments
 from ..contracts import Clip, Progress
-from ..errors import InputError
+from ..errors import HeadbenchError, InputError
 from ..io.files import check_name
 from ..progress import progress
 from ..registry import finds, get, readers, resolve
@@ -94,13 +94,17 @@ def capture_configuration(
     head : str | None
         Head model file, for captures without one.
     """
-    return RunConfig(
-        data=data,
-        out=out,
-        reader=reader or reader_of(data),
-        reader_settings={} if head is None else {"head": head},
-        **others,
-    )
+    reader = reader or reader_of(data)
+    try:
+        return RunConfig(
+            data=data,
+            out=out,
+            reader=reader,
+            reader_settings={} if head is None else {"head": head},
+            **others,
+        )
+    except ValueError as error:
+        raise HeadbenchError(f"command line: {error}") from error
 
 
 def synthesis_arguments(steps: Sequence[Mapping[str, Any]], subject: str) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from ..io.documents import checked, read_json
 from ..io.files import digest, write_json, write_text
 from ..options import iterations
 from ..protocol import needed
-from ..registry import get
+from ..registry import get, unknown
 from ..specs import CommandResult, MethodSpec, command
 from .forecast import TIMESTEPS, Amounts, Rates, bytes_left, forecast, measure, runs_of
 from .specs import MOVED_LINES
@@ -98,10 +98,15 @@ class ReproduceSettings(ExecutionOptions):
     to review them before anything is trained."""
 
     def __post_init__(self) -> None:
-        """Refuse invalid numbers."""
-        if self.timed < 2:
-            raise InputError("command line", "--timed", "at least 2", str(self.timed))
-        iterations(self.iterations)
+        """Refuse invalid numbers, and settings that no run can have."""
+        for name, least in (("timed", 2), ("downscale", 1)):
+            if (value := getattr(self, name)) < least:
+                raise InputError("command line", f"--{name}", f"at least {least}", str(value))
+        trained = {*self.methods, *([OURS] if self.ablation else [])}
+        for name in iterations(self.iterations):
+            if name not in trained:
+                raise unknown("command line", "--iterations", name, trained)
+        planned_runs(self)
 
     def preparation(self, part: str) -> PrepareSettings:
         """Settings of the conversion of the recordings of one part."""

@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import cv2
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from ..contracts import ByteArray, FloatArray
 from ..errors import HeadbenchError, InputError, UnavailableError, install_extra
@@ -177,6 +177,16 @@ def probe_image(path: Path, *, decode: bool = False) -> ImageInfo:
         if decode:
             _decode(path, stream, info)
     return info
+
+
+UPRIGHT = 1
+"""Orientation of pixels that are stored as they are shown."""
+
+
+def orientation_of(path: Path) -> int:
+    """The orientation in the EXIF data of a JPEG, which no function here applies."""
+    with reading(path, "a JPEG with readable EXIF data"), Image.open(path) as image:
+        return int(image.getexif().get(ExifTags.Base.Orientation, UPRIGHT))
 
 
 def read_pixels(path: Path, size: tuple[int, int] | None = None) -> ByteArray:

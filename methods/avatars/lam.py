@@ -278,8 +278,8 @@ def export_lam(settings: ExportLamSettings, progress: Progress = no_progress) ->
             raise InputError(out, "", "a new folder, or that of an earlier export", f"also {others[0]}")
     _, head, source, _ = open_source(settings, progress)
     count = len(source.avatar.splats(source.rest).means)
-    if count > MOST_SPLATS:
-        expected = f"an avatar of at most {MOST_SPLATS} splats, which the viewers can show"
+    if not 0 < count <= MOST_SPLATS:
+        expected = f"an avatar of 1 to {MOST_SPLATS} splats, which the viewers can show"
         raise InputError(Path(settings.avatar), "", expected, str(count))
     faces = perform(head, source.rest, progress)
     sampled = sample(source, faces.single, progress)

@@ -10,7 +10,6 @@ import tyro
 
 from ....bench.contracts import Progress, no_progress
 from ....bench.errors import ExitCode, InputError, UnavailableError
-from ....bench.io.files import check_kind
 from ....bench.specs import CommandResult, command
 from ..names import chosen_subjects
 
@@ -48,7 +47,7 @@ class BenchmarkPrepareSettings:
     """Number of cameras processed at a time; 0 stands for one per processor core."""
 
 
-@command("prepare benchmark", group="data", writes="out")
+@command("prepare benchmark", group="data", writes="out", kinds=("captures",))
 def prepare_benchmark(settings: BenchmarkPrepareSettings, progress: Progress = no_progress) -> CommandResult:
     """Convert the training data of the NeRSemble benchmark to captures."""
     from ...head.loaders import load_head
@@ -67,7 +66,6 @@ def prepare_benchmark(settings: BenchmarkPrepareSettings, progress: Progress = n
         if settings.participants
         else [*participants(root)]
     )
-    check_kind(out, "captures")
     head = load_head(settings.head)
     plans = [
         plan_participant(data, track, participant(root, subject), head, out, settings.test, settings.every)

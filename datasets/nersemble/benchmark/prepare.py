@@ -52,6 +52,9 @@ def plan_participant(
         expected = "sequences with images/cam_SERIAL.mp4"
         remedy = f"Download them: nersemble-benchmark-download FOLDER {track.name}."
         raise InputError(data / track.name / one.subject, "sequences", expected, "none", remedy)
+    planned = {*names, *track.sequences.get(one.subject, {})}
+    if lacking := [name for name in SEQUENCES if name in one.sequences and name not in planned]:
+        log.warning("%s: no videos of %s, which are left out", one.subject, some(lacking))
     held_out = [match_sequence(data, name, names) for name in test]
     if not set(names) - set(held_out):
         raise InputError("command line", "--test", "at least one sequence to train on", ", ".join(held_out))

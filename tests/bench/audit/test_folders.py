@@ -21,6 +21,8 @@ from headbench.metrics.psnr import psnr
 
 RNG = np.random.default_rng(0)
 NAMES = ("a/2", "a/10", "b/1")
+TURNED = Image.Exif()
+TURNED[0x0112] = 3
 INSIDE = np.zeros((24, 32), np.uint8)
 INSIDE[4:20, 6:22] = 255
 
@@ -155,6 +157,12 @@ FAULTS = {
         lambda: Image.fromarray(np.full((24, 32, 4), 90, np.uint8)).save("renders/a/2.png"),
         "renders/a/2.png, alpha: .*transparent",
     ),
+    "an orientation": (
+        lambda: Image.open(Path("renders/a/2.png").rename("renders/a/2.jpg")).save(
+            "renders/a/2.jpg", exif=TURNED
+        ),
+        "renders/a/2.jpg, EXIF: expected pixels stored upright, found orientation 3",
+    ),
     "a damaged image": (lambda: Path("truth/a/10.png").write_bytes(b"no image"), "truth/a/10.png: .*PNG or JPEG"),
 }  # fmt: skip
 
@@ -185,10 +193,30 @@ def test_metrics_that_need_more_than_images_are_refused(folders, capsys, metric,
     assert message in capsys.readouterr().err
 
 
-def test_a_device_that_torch_lacks_is_refused(folders, capsys):
-    words = ["renders", "--truth", "truth", "--metrics", "l1", "--device", "banana"]
-    assert cli.main(["evaluate", *words]) == 2
-    assert "device, banana" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--device", "banana"], "device, banana"),
+        (["--truth", "a/../renders"], "--truth: expected another folder or file than the renders"),
+        (["--out", "renders/a/2.png"], "--out: expected a CSV file to write, found renders/a/2.png"),
+    ],
+)
+def test_options_that_cannot_be_meant_are_refused(folders, capsys, words, message):
+    Path("a").mkdir()
+    before = read_png(Path("renders/a/2.png"))
+    assert cli.main(["evaluate", "renders", "--truth", "truth", "--metrics", "l1", *words]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    np.testing.assert_array_equal(read_png(Path("renders/a/2.png")), before)
+
+
+def test_a_wrong_network_is_found_first(folders, capsys, monkeypatch):
+    """Before the metrics of single frames are computed for all pairs."""
+    read = []
+    monkeypatch.setattr(module.PairedImages, "image", lambda self, key: read.append(key) or picture())
+    monkeypatch.setenv("HEADBENCH_INCEPTION", "truth/a/2.png")
+    assert cli.main(["evaluate", "renders", "--truth", "truth", "--metrics", "l1,fid"]) == 2
+    assert "truth/a/2.png: expected a PyTorch file of weights" in capsys.readouterr().err
+    assert {key.sequence + str(key.timestep) for key in read} == {"a0"}
 
 
 @pytest.fixture

@@ -96,6 +96,7 @@ def test_a_capture_is_listed_as_its_run_is(run, tmp_path):
     options = ["--tasks", "novel_view", "--frames-per-task", "2"]
     assert cli.main(["frames", capture, "--out", str(tmp_path / "c"), *reader, *options]) == 0
     assert [row["task"] for row in listed(tmp_path / "c/frames.csv")] == ["novel_view"] * 2
+    assert cli.main(["frames", capture, "--out", str(tmp_path / "d"), *reader, "--frames-per-task", "0"]) == 2
     for options in (["--tasks", "novel_view"], ["--frames-per-task", "2"], ["--reader", "ga"]):
         assert cli.main(["frames", str(run), "--out", str(tmp_path / "d"), "--trust", *options]) == 2
     assert not (tmp_path / "d").exists()

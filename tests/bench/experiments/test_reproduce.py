@@ -134,6 +134,22 @@ def test_a_sequence_without_tracking_is_named_first(tmp_path, capsys):
     assert not (tmp_path / "o" / "plan").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--device cude", "device is 'cude'"),
+        ("--methods ga ga", "methods names something twice: ga, ga"),
+        ("--downscale 0", "--downscale: expected at least 1, found 0"),
+        ("--timed 1", "--timed: expected at least 2, found 1"),
+        ("--methods ga --iterations gbs=3", "--iterations: expected one of ga, ours, found 'gbs'"),
+    ],
+)
+def test_what_no_run_can_have_is_refused(words, message, capsys):
+    required = ["--data", "d", "--tracking", "t", "--head", "h", "--out", "o"]
+    assert cli.main(["run", "reproduce", "tensorial-2025", *required, *words.split()]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
 def rehearsal(folder: Path) -> list[str]:
     """Recordings of two subjects with a stand-in for FLAME of both years, and the command that reproduces the paper on them."""
     flame = folder / "flame"

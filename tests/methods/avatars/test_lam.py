@@ -4,6 +4,7 @@ import json
 import struct
 import zipfile
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -174,13 +175,17 @@ def test_bones_place_the_head_before_the_camera(exported, source):
     assert 0.5 < np.abs(up / depth).max() / np.tan(np.radians(25)) < 1
 
 
-def test_avatars_beyond_the_viewers_texture_are_refused(source, tmp_path):
+@pytest.mark.parametrize("empty", [False, True])
+def test_avatars_that_viewers_cannot_show_are_refused(source, tmp_path, empty):
     opened = Opened(None, procedural_head(), source, None)
     settings = ExportLamSettings("avatar", str(tmp_path / "face.zip"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lam, "open_source", lambda settings, progress: opened)
         patch.setattr(lam, "MOST_SPLATS", 100)
-        with pytest.raises(InputError, match="at most 100 splats"):
+        if empty:
+            nothing = SimpleNamespace(means=np.empty((0, 3)))
+            patch.setattr(source.avatar, "splats", lambda pose: nothing, raising=False)
+        with pytest.raises(InputError, match="of 1 to 100 splats"):
             lam.export_lam(settings, no_progress)
     assert not [*tmp_path.iterdir()]
 
