@@ -284,6 +284,9 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
     if settings.source is not None:
         config = with_methods(config, [get("methods", name).name for name in config.methods])
     check_kind(Path(config.out), "a run")  # before the log is written there
+    if settings.protocol:
+        for clip in open_clips(config):
+            check_capture(settings.protocol, clip)
     if settings.dry_run:
         from .engine.run import planned_cells
 
@@ -292,9 +295,6 @@ def run(settings: RunSettings, progress: Progress) -> CommandResult:
         return CommandResult(
             "\n".join(lines), {"cells": [{"cell": name, "state": state} for name, state in cells.items()]}
         )
-    if settings.protocol:
-        for clip in open_clips(config):
-            check_capture(settings.protocol, clip)
     from .engine.run import run as run_comparison
 
     with _log_file(Path(config.out)):

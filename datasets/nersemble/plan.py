@@ -36,7 +36,9 @@ IMAGES_VERSION = 1
 """Increased when the same recording and settings give other images than before."""
 
 _USUAL_HEAD = "flame2023"
-_FLAME_VERSIONS = ("flame2020", _USUAL_HEAD, "flame2023_no_jaw", OPEN)
+_OTHER_HEADS = {"flame2020": "FLAME 2020", OPEN: "FLAME 2023 Open"}
+"""Versions of FLAME that the published tracking was not made with."""
+_FLAME_VERSIONS = (_USUAL_HEAD, "flame2023_no_jaw", *_OTHER_HEADS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,9 +190,9 @@ def _head_version(settings: PrepareSettings, head: HeadArrays | None) -> str:
         if stated not in ("", head.version):
             expected = f"{head.version!r}, the version of {settings.head}"
             raise InputError("command line", "--head-model", expected, repr(stated), "Leave it out.")
-        if head.version == OPEN != stated:  # the published tracking is that of FLAME 2023
-            remedy = f"{settings.head} is FLAME 2023 Open: say so if the tracking was made with it, else give FLAME 2023."
-            raise InputError("command line", "--head-model", repr(OPEN), "nothing", remedy)
+        if head.version in _OTHER_HEADS and not stated:
+            remedy = f"{settings.head} is {_OTHER_HEADS[head.version]}: say so if the tracking was made with it, else give FLAME 2023."
+            raise InputError("command line", "--head-model", repr(head.version), "nothing", remedy)
         return head.version
     versions = (*_FLAME_VERSIONS, *VERSIONS)
     if stated and stated not in versions:
