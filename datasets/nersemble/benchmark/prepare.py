@@ -52,7 +52,7 @@ def plan_participant(
         expected = "sequences with images/cam_SERIAL.mp4"
         remedy = f"Download them: nersemble-benchmark-download FOLDER {track.name}."
         raise InputError(data / track.name / one.subject, "sequences", expected, "none", remedy)
-    held_out = [match_sequence(data, name, names) for name in test]
+    held_out = [match_sequence("--test", name, names) for name in test]
     if not set(names) - set(held_out):
         raise InputError("command line", "--test", "at least one sequence to train on", ", ".join(held_out))
     calibration = read_calibration(one.calibration_file)
