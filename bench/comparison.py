@@ -327,9 +327,8 @@ def closing(run: Path, rows: Rows) -> str:
     if not page.is_file():
         first = f"Report: none was written, see {run / 'run.log'}; `headbench report {folder} --out {folder}/{page.name}` tries again"
     subjects, methods = len(rows.subjects), len(rows.methods)
-    contents = (
-        "tables, every method beside the captured images frame by frame, error maps, curves, worst frames"
-    )
+    frames = ", every method beside the captured images frame by frame, error maps, curves, worst frames"
+    contents = f"tables{frames if rows.tasks else ''}"
     failed = "; a training or measurement failed, and the tables say which" if rows.failed else ""
     second = f"It shows {counted(methods, 'method')} on {counted(subjects, 'subject')}: {contents}{failed}."
     why = [f"`headbench status {folder}` (why something failed)"] if rows.failed else []

@@ -186,13 +186,15 @@ NICE_SCALES = (2, 5, 10, 20, 50, 100, 255)
 
 
 def write_contact_sheet(run: Path | FinishedRun, frames_per_task: int = FRAMES_PER_TASK) -> list[Path]:
-    """Draw some frames of each task, evenly spaced over its sorted keys; return the file written."""
+    """Draw some frames of each task, evenly spaced over its sorted keys; return the file written, none without frames."""
     data = RunData.read(run)
     frames = [
         compared_frame(data, task, key, data.methods)
         for task in data.tasks
         for key in evenly(data.keys(task), frames_per_task)
     ]
+    if not frames:
+        return []
     protocols = ", ".join(f"{p.id} ({p.hash})" for p in data.manifest.protocols.values())
     subjects = dict.fromkeys(key.subject for task in data.tasks for key in data.keys(task))
     contact_sheet(

@@ -284,15 +284,12 @@ class _Column:
     def shown(self, value: float | None) -> str:
         return "–" if value is None else f"{value:.{self.spec.digits}f}"
 
-    def missing(self, pairs: Sequence[Pair]) -> list[str]:
-        """Sentences on values that are missing."""
+    def missing(self, pairs: Sequence[Pair]) -> Counter[str]:
+        """Numbers of values that are missing, by reason."""
         reasons = Counter(score.reason for score in self.scores.values() if score.status != "ok")
         if empty := sum(pair.key not in self.scores for pair in pairs):
             reasons[f"no pixels in the {self.region}"] = empty
-        return [
-            f"{reason.rstrip('.')} ({self.head[:-2]}, {count} of {counted(len(pairs), 'pair')})."
-            for reason, count in reasons.items()
-        ]
+        return reasons
 
 
 def score_pairs(
@@ -335,7 +332,14 @@ def score_pairs(
         notes += _protocol_notes(protocols[0], protocol, f"{width}x{height}")
     if lossy := sum(pair.render.suffix.lower() != ".png" for pair in pairs):
         notes.append(f"The compression of {counted(lossy, 'render')} as JPEG or video is scored, too.")
-    notes += [sentence for column in columns for sentence in column.missing(pairs)]
+    missing: dict[tuple[str, int], list[str]] = {}
+    for column in columns:
+        for why in column.missing(pairs).items():
+            missing.setdefault(why, []).append(column.head[:-2])
+    notes += [
+        f"{reason.rstrip('.')} ({', '.join(heads)}, {count} of {counted(len(pairs), 'pair')})."
+        for (reason, count), heads in missing.items()
+    ]
     if out is not None:
         write_text(out, _csv(pairs, columns))
         notes.append(str(out))
@@ -391,7 +395,10 @@ def _means(
     means = {name: [column.mean(of, whole=single) for column in columns] for name, of in sequences.items()}
     over_sequences = [_mean([mean for mean in of if mean is not None]) for of in zip(*means.values())]
     over_pairs = [column.pooled_mean(pairs, pooled) for column in columns]
-    rows = [(name or title, len(sequences[name]), values) for name, values in means.items()]
+    rows = [
+        (name or title, len(sequences[name]), over_pairs if single else values)
+        for name, values in means.items()
+    ]
     if not single:
         rows = rows if len(rows) <= MOST_ROWS else []
         rows.append((f"mean of {len(means)} sequences", len(pairs), over_sequences))

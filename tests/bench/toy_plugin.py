@@ -265,6 +265,7 @@ def files_in_avatar(avatar, workload):
 
 ERROR = MetricSpec("error", "Error", "levels", False, 2, "toy_plugin:mean_error")
 NOT_HERE = MetricSpec("not_here", "Absent", "", True, 2, "toy_plugin:not_here")
+NOT_THERE = replace(NOT_HERE, name="not_there", label="Lacking")
 FILES = MetricSpec("files", "Files", "", False, 0, "toy_plugin:files_in_avatar", kind="avatar")
 FILES_LOAD = replace(FILES, name="files_load", detail="frames")
 FILES_NONE = replace(FILES, name="files_none", detail="not told")

@@ -61,6 +61,11 @@ def prepare_benchmark(settings: BenchmarkPrepareSettings, progress: Progress = n
     for key, least in (("every", 1), ("workers", 0)):
         if (value := getattr(settings, key)) < least:
             raise InputError("command line", f"--{key}", f"a number from {least}", f"{value}")
+    if not root.is_dir():
+        remedy = f"Name the folder that holds {track.name}/, or download it: nersemble-benchmark-download FOLDER {track.name}."
+        raise InputError(
+            root, "", "a folder of the benchmark", "a file" if root.exists() else "nothing", remedy
+        )
     subjects = (
         chosen_subjects(settings.participants, "--participants")
         if settings.participants

@@ -55,7 +55,7 @@ def plan_participant(
     planned = {*names, *track.sequences.get(one.subject, {})}
     if lacking := [name for name in SEQUENCES if name in one.sequences and name not in planned]:
         log.warning("%s: no videos of %s, which are left out", one.subject, some(lacking))
-    held_out = [match_sequence(data, name, names) for name in test]
+    held_out = [match_sequence("--test", name, names) for name in test]
     if not set(names) - set(held_out):
         raise InputError("command line", "--test", "at least one sequence to train on", ", ".join(held_out))
     calibration = read_calibration(one.calibration_file)

@@ -82,7 +82,13 @@ def test_the_table_has_means_and_says_what_is_missing(folders, capsys):
     for name in NAMES:
         Path(f"renders/{name}.png").rename(f"renders/{name}.jpg")
         Path(f"renders/{name}.jpg").write_bytes(cv2.imencode(".jpg", picture())[1].tobytes())
-    words = ["renders", "--truth", "truth", "--metrics", "l1,ssim@skimage,toy_plugin:NOT_HERE"]
+    words = [
+        "renders",
+        "--truth",
+        "truth",
+        "--metrics",
+        "l1,ssim@skimage,toy_plugin:NOT_HERE,toy_plugin:NOT_THERE",
+    ]
     assert cli.main(["evaluate", *words]) == 0
     text = capsys.readouterr().out
     for part in (
@@ -90,7 +96,7 @@ def test_the_table_has_means_and_says_what_is_missing(folders, capsys):
         "SSIM (skimage) ↑",
         "mean of 2 sequences",
         "mean of pairs",
-        "(Absent, 3 of 3 pairs)",
+        "(Absent, Lacking, 3 of 3 pairs)",
     ):
         assert part in text
     assert "3 renders as JPEG or video" in text
@@ -122,6 +128,17 @@ def test_a_protocol_chooses_metrics_and_batches(folders, capsys, monkeypatch):
     errors = [10 ** (-float(row["psnr@piq"]) / 10) for row in rows]
     batches = [-10 * np.log10(np.mean(errors[:2])), -10 * np.log10(errors[2])]
     assert data["mean_of_pairs"]["psnr@piq"] == pytest.approx(np.mean(batches))
+
+
+def test_psnr_of_a_single_folder_is_that_of_the_protocol(folders, capsys):
+    """Its errors are averaged before the logarithm, as for pairs of several folders."""
+    for level in (16, 1):
+        write_png(folders / f"black/{level}.png", np.zeros((24, 32, 3), np.uint8))
+        write_png(folders / f"grey/{level}.png", np.full((24, 32, 3), level, np.uint8))
+    words = ["evaluate", "black", "--truth", "grey", "--protocol", "vfhq-self"]
+    assert cli.main([*words, "--metrics", "psnr"]) == 0
+    pooled = -10 * np.log10((16**2 + 1) / 2 / 255**2)
+    assert f" {pooled:.2f}\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
