@@ -22,7 +22,7 @@ import readme_pictures
 
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
-from headbench.bench.experiments.specs import MOVED_LINES, RECORD_FILE, RECORDED_RUN, RUN
+from headbench.bench.experiments.specs import MOVED_LINES, RECORD_FILE, RECORDED_RUN, RUN, SEEDS_RUN
 from headbench.bench.io.files import write_json, write_text
 from headbench.bench.progress import counted
 from headbench.bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
@@ -41,6 +41,7 @@ from headbench.reports.suite.suite import (
     planned_subjects,
     primary_table,
     read_extremes,
+    variance_section,
 )
 from headbench.reports.table_report import Columns, table_of
 from headbench.reports.tables import build_table
@@ -93,6 +94,13 @@ class StoredResults:
         """The runs of the suite on captures as recordings are."""
         return self.read(*self.runs(f"suite/{RECORDED_RUN}"))
 
+    @property
+    def seeded(self) -> RunSet:
+        """The face in the runs of the subjects on which `OURS` and `REFERENCE` have further training seeds, as recordings are."""
+        seeds = self.runs(f"suite/{SEEDS_RUN}")
+        first = [self.gallery / "suite" / RECORDED_RUN / run.name for run in seeds]
+        return self.read(*first, *seeds).only([OURS, REFERENCE]).of(FrameSelection(FACE))
+
     def blocks(self) -> dict[tuple[str, str], str]:
         """Every block by its page and name."""
         demo, profiles, faces = (self.read(self.gallery / name) for name in ("", "profiles", "faces"))
@@ -110,10 +118,11 @@ class StoredResults:
             ("README.md", "findings"): findings(
                 self.recorded, self.curve(*CURVED), self.curve(OURS, REFERENCE)
             ),
-            (f"{DOCS}/results.md", "endpoints"): primary_table(self.recorded, self.suite),
+            (f"{DOCS}/results.md", "endpoints"): primary_table(self.recorded),
             (f"{DOCS}/results.md", "differences"): psnr_differences(self.recorded, BESIDE, REFERENCE),
             (f"{DOCS}/results.md", "exact"): psnr_differences(self.suite, BESIDE, REFERENCE, (FACE,)),
             (f"{DOCS}/results.md", "table-4"): moved_lines(self.recorded, self.suite),
+            (f"{DOCS}/results.md", "seeds"): seed_differences(self.seeded),
             (f"{DOCS}/results.md", "curves"): curve_table(self.curve(*CURVED), self.curve(OURS, REFERENCE)),
             (f"{DOCS}/results.md", "further-curves"): trainings(self.curve(of=FIRST)),
             (f"{DOCS}/results.md", "sizes"): sizes({run.name: self.read(run) for run in self.runs("sizes")}),
@@ -242,6 +251,13 @@ def moved_lines(recorded: RunSet, exact: RunSet) -> str:
     return f"{pipe_table(lines)}\n\n\\* All cameras, of which one has no training images."
 
 
+def seed_differences(runs: RunSet) -> str:
+    """The rows of `variance_section` on the difference of `OURS` from `REFERENCE`."""
+    table = variance_section(runs, (OURS, REFERENCE)).split("\n\n")[1]
+    own = [f"| {name} |" for name in (OURS, REFERENCE)]
+    return "\n".join(line for line in table.splitlines() if not line.startswith(tuple(own)))
+
+
 def psnr_differences(
     runs: RunSet, methods: Sequence[str], reference: str, regions: Sequence[str] = (FULL, FACE)
 ) -> str:
@@ -340,7 +356,10 @@ def curve_table(curve: CurveData, pair: CurveData) -> str:
     of_face = [spec for spec in curve.metrics if spec.name == f"psnr_{FACE}"]
     led = [leaders_text(replace(each, metrics=of_face)) for each in (curve, pair)]
     names = " and ".join(f"`{name}`" for name in pair.by_method)
-    return "\n\n".join([trainings(curve), led[0], f"Of {names} alone:", led[1].partition("\n\n")[2]])
+    kinds = " / ".join(TASK_TITLES[task].lower() for task in curve.tasks)
+    over = counted(len(curve.subjects), "subject")
+    head = f"PSNR of the face in dB, {kinds}, and processor seconds of the training; means over {over}:"
+    return "\n\n".join([head, trainings(curve), led[0], f"Of {names} alone:", led[1].partition("\n\n")[2]])
 
 
 def trainings(curve: CurveData) -> str:
@@ -350,10 +369,7 @@ def trainings(curve: CurveData) -> str:
     for method, points in curve.by_method.items():
         cells = {point.part: curve_cell(point, curve) for point in points}
         lines.append([f"`{method}`", *(cells.get(part, "ended") for part in parts)])
-    kinds = " / ".join(TASK_TITLES[task].lower() for task in curve.tasks)
-    over = counted(len(curve.subjects), "subject")
-    head = f"PSNR of the face in dB, {kinds}, and processor seconds of the training; means over {over}:"
-    return f"{head}\n\n{pipe_table(lines)}"
+    return pipe_table(lines)
 
 
 def curve_cell(point: CurvePoint, curve: CurveData) -> str:

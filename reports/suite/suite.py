@@ -115,8 +115,8 @@ HOW = (
 )
 
 
-def primary_table(recorded: RunSet, exact: RunSet | None) -> str:
-    """Differences, intervals and verdicts of the endpoints, and the same differences elsewhere, as Markdown; "" if runs lack them.
+def primary_table(recorded: RunSet) -> str:
+    """Differences, intervals and verdicts of the endpoints as Markdown; "" if runs lack them.
 
     As long as planned subjects are missing, the results are interim and have no verdict: testing again after
     each further subject would reject too often.
@@ -127,35 +127,35 @@ def primary_table(recorded: RunSet, exact: RunSet | None) -> str:
     planned = planned_subjects(recorded)
     specs = {spec.name: spec for spec in recorded.metrics}
     lines = [["endpoint", "difference (interval)", "p", "Holm", ""], ["---"] * 5]
-    others = [["endpoint", "whole frames", "exact captures", "exact captures, whole frames"], ["---"] * 4]
     for endpoint, c in zip(PRIMARY, endpoints, strict=True):
-        title, digits = endpoint.title(recorded), specs[endpoint.metric].digits + 1
         interim = f"interim: {c.subjects} of {planned} subjects" if c.subjects < planned else ""
         tests = ["", ""] if c.p is None or c.p_holm is None else [f"{c.p:.4f}", f"{c.p_holm:.4f}"]
         verdict = f"{c.verdict}: {c.reason}" if c.reason else interim or c.verdict
-        lines.append([title, c.text(digits), *tests, verdict])
+        lines.append([endpoint.title(recorded), c.text(specs[endpoint.metric].digits + 1), *tests, verdict])
+    tested = sum(c.p is not None for c in endpoints)
+    test = f"Exact sign-flip tests over subjects, Holm over the {tested} endpoints with values, level {TEST_LEVEL:.0%}."
+    return f"{pipe_table(lines)}\n\n{HOW} {test}"
+
+
+def elsewhere_table(recorded: RunSet, exact: RunSet | None) -> str:
+    """The differences of the endpoints in whole frames and on exact captures, which have no test, as Markdown."""
+    lines = [["endpoint", "whole frames", "exact captures", "exact captures, whole frames"], ["---"] * 4]
+    specs = {spec.name: spec for spec in recorded.metrics}
+    for endpoint in PRIMARY:
         beside = [endpoint.compared(recorded, whole=True)]
         if exact is not None and primary_comparisons(exact):
             beside += [endpoint.compared(exact), endpoint.compared(exact, whole=True)]
-        cells = [each.text(digits) for each in beside]
-        others.append([title, *cells, *["–"] * (3 - len(cells))])
-    tested = sum(c.p is not None for c in endpoints)
-    test = f"Exact sign-flip tests over subjects, Holm over the {tested} endpoints with values, level {TEST_LEVEL:.0%}."
-    return "\n\n".join(
-        [
-            pipe_table(lines),
-            f"{HOW} {test}",
-            "The same differences elsewhere, without a test:",
-            pipe_table(others),
-        ]
-    )
+        cells = [each.text(specs[endpoint.metric].digits + 1) for each in beside]
+        lines.append([endpoint.title(recorded), *cells, *["–"] * (3 - len(cells))])
+    return f"The same differences elsewhere, without a test:\n\n{pipe_table(lines)}"
 
 
 def primary_section(recorded: RunSet | None, exact: RunSet | None) -> str:
     """The endpoints as Markdown, with the status of the page's other differences."""
-    found = "" if recorded is None else primary_table(recorded, exact)
-    none = "These runs lack methods, metrics or captures of the endpoints."
-    return f"## Primary endpoints\n\n{found or none} All other differences on this page are shown with intervals alone, without a test."
+    found = "These runs lack methods, metrics or captures of the endpoints."
+    if recorded is not None and (tested := primary_table(recorded)):
+        found = f"{tested}\n\n{elsewhere_table(recorded, exact)}"
+    return f"## Primary endpoints\n\n{found} All other differences on this page are shown with intervals alone, without a test."
 
 
 FOLDER = "extremes"
