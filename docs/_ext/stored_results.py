@@ -54,8 +54,6 @@ BESIDE = (OURS, MOVED, "ours-plus", "gbs")
 """Methods of the results page's differences from `REFERENCE`."""
 CURVED = (REFERENCE, "gbs", OURS, "ours-plus")
 """Methods with a curve on every development subject."""
-FIRST = "900"
-"""The development subject on which all methods have a curve."""
 COLUMNS = (
     ("Face PSNR, novel views (dB) ↑", FACE, "psnr", NOVEL, 1),
     ("Face PSNR, new expressions (dB) ↑", FACE, "psnr", UNSEEN_CAMERAS, 1),
@@ -77,7 +75,7 @@ class StoredResults:
         self.run = cache(RunData.read)
         self.read = cache(lambda *folders: RunSet.joined(tuple(map(self.run, folders))))
         self.curve = cache(
-            lambda *methods, of="": read_curve([*map(self.run, self.runs(f"curves/{of}"))], "budget", methods)
+            lambda *methods: read_curve([*map(self.run, self.runs("curves"))], "budget", methods)
         )
 
     def runs(self, name: str) -> list[Path]:
@@ -122,9 +120,10 @@ class StoredResults:
             (f"{DOCS}/results.md", "differences"): psnr_differences(self.recorded, BESIDE, REFERENCE),
             (f"{DOCS}/results.md", "exact"): psnr_differences(self.suite, BESIDE, REFERENCE, (FACE,)),
             (f"{DOCS}/results.md", "table-4"): moved_lines(self.recorded, self.suite),
-            (f"{DOCS}/results.md", "seeds"): seed_differences(self.seeded),
+            (f"{DOCS}/results.md", "seeds"): variance_section(self.seeded, (OURS, REFERENCE)).partition(
+                "\n\n"
+            )[2],
             (f"{DOCS}/results.md", "curves"): curve_table(self.curve(*CURVED), self.curve(OURS, REFERENCE)),
-            (f"{DOCS}/results.md", "further-curves"): trainings(self.curve(of=FIRST)),
             (f"{DOCS}/results.md", "sizes"): sizes({run.name: self.read(run) for run in self.runs("sizes")}),
             (f"{DOCS}/results.md", "extremes"): extremes(read_extremes(self.runs(f"suite/{RUN}"))),
             (f"{DOCS}/protocols.md", "protocols"): choices(self.recorded),
@@ -251,13 +250,6 @@ def moved_lines(recorded: RunSet, exact: RunSet) -> str:
     return f"{pipe_table(lines)}\n\n\\* All cameras, of which one has no training images."
 
 
-def seed_differences(runs: RunSet) -> str:
-    """The rows of `variance_section` on the difference of `OURS` from `REFERENCE`."""
-    table = variance_section(runs, (OURS, REFERENCE)).split("\n\n")[1]
-    own = [f"| {name} |" for name in (OURS, REFERENCE)]
-    return "\n".join(line for line in table.splitlines() if not line.startswith(tuple(own)))
-
-
 def psnr_differences(
     runs: RunSet, methods: Sequence[str], reference: str, regions: Sequence[str] = (FULL, FACE)
 ) -> str:
@@ -352,24 +344,18 @@ def choices(runs: RunSet, suite: str = "the suite") -> str:
 
 
 def curve_table(curve: CurveData, pair: CurveData) -> str:
-    """`trainings` of a curve, and the best methods, of all and of a pair."""
-    of_face = [spec for spec in curve.metrics if spec.name == f"psnr_{FACE}"]
-    led = [leaders_text(replace(each, metrics=of_face)) for each in (curve, pair)]
-    names = " and ".join(f"`{name}`" for name in pair.by_method)
-    kinds = " / ".join(TASK_TITLES[task].lower() for task in curve.tasks)
-    over = counted(len(curve.subjects), "subject")
-    head = f"PSNR of the face in dB, {kinds}, and processor seconds of the training; means over {over}:"
-    return "\n\n".join([head, trainings(curve), led[0], f"Of {names} alone:", led[1].partition("\n\n")[2]])
-
-
-def trainings(curve: CurveData) -> str:
-    """PSNR of the face and processor seconds by method and length of training."""
+    """PSNR of the face and processor seconds by method and length of training, and the best methods, of all and of a pair."""
     parts = sorted({point.part for point in curve.means})
     lines = [["Method", *(f"{part} of the longest" for part in parts)], ["---", *["---"] * len(parts)]]
     for method, points in curve.by_method.items():
         cells = {point.part: curve_cell(point, curve) for point in points}
         lines.append([f"`{method}`", *(cells.get(part, "ended") for part in parts)])
-    return pipe_table(lines)
+    kinds = " / ".join(TASK_TITLES[task].lower() for task in curve.tasks)
+    head = f"PSNR of the face in dB, {kinds}, and processor seconds of the training; means over {counted(len(curve.subjects), 'subject')}:"
+    of_face = [spec for spec in curve.metrics if spec.name == f"psnr_{FACE}"]
+    led = [leaders_text(replace(each, metrics=of_face)) for each in (curve, pair)]
+    names = " and ".join(f"`{name}`" for name in pair.by_method)
+    return "\n\n".join([head, pipe_table(lines), led[0], f"Of {names} alone:", led[1].partition("\n\n")[2]])
 
 
 def curve_cell(point: CurvePoint, curve: CurveData) -> str:

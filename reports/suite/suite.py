@@ -141,9 +141,11 @@ def elsewhere_table(recorded: RunSet, exact: RunSet | None) -> str:
     """The differences of the endpoints in whole frames and on exact captures, which have no test, as Markdown."""
     lines = [["endpoint", "whole frames", "exact captures", "exact captures, whole frames"], ["---"] * 4]
     specs = {spec.name: spec for spec in recorded.metrics}
+    if exact is not None and not primary_comparisons(exact):
+        exact = None
     for endpoint in PRIMARY:
         beside = [endpoint.compared(recorded, whole=True)]
-        if exact is not None and primary_comparisons(exact):
+        if exact is not None:
             beside += [endpoint.compared(exact), endpoint.compared(exact, whole=True)]
         cells = [each.text(specs[endpoint.metric].digits + 1) for each in beside]
         lines.append([endpoint.title(recorded), *cells, *["–"] * (3 - len(cells))])
