@@ -49,6 +49,8 @@ log = logging.getLogger(__name__)
 _OWN = "headbench"
 INDEX = Path(__file__).with_name("commands.json")
 """Specs of headbench's commands, so that a list of them imports none of their modules; ``make index`` writes it."""
+MOST_NAMES, NEAREST = 20, 5
+"""Of more names, the error for an unknown one shows the nearest only; their number."""
 
 
 @dataclass(frozen=True)
@@ -127,11 +129,16 @@ def finds(spec: DatasetSpec, root: Path) -> bool:
 
 
 def unknown(file: str, key: str, name: str, known: Any, remedy: str = "") -> InputError:
-    """Build the error for a name that is not among ``known``, with the nearest one as a hint before ``remedy``."""
+    """Build the error for a name that is not among ``known``, with the nearest one as a hint before ``remedy``.
+
+    Of many names it shows the nearest ones only.
+    """
     names = sorted(known)
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
+    near = difflib.get_close_matches(name, names, n=NEAREST, cutoff=0.4)
     hint = f"Did you mean {near[0]!r}?" if near else ""
-    return InputError(file, key, f"one of {', '.join(names)}", repr(name), f"{hint} {remedy}".strip())
+    many = near and len(names) > MOST_NAMES
+    listed = f"{', '.join(near)} or {len(names) - len(near)} others" if many else ", ".join(names)
+    return InputError(file, key, f"one of {listed}", repr(name), f"{hint} {remedy}".strip())
 
 
 def entry_points(group: str) -> tuple[EntryPoint, ...]:

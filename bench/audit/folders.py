@@ -18,7 +18,7 @@ from PIL import Image
 from ..contracts import BoolArray, ByteArray, FrameKey, Progress
 from ..engine.config import default_names
 from ..engine.scoring import FACE, Score, ScoredFrames, score_frames
-from ..errors import InputError
+from ..errors import ExitCode, InputError
 from ..io.files import check_writable, entries, natural_order, write_text
 from ..io.images import UPRIGHT, orientation_of, probe_image, read_pixels, read_png
 from ..io.videos import SUFFIXES, video_frames
@@ -303,7 +303,10 @@ def score_pairs(
     device: str,
     progress: Progress,
 ) -> CommandResult:
-    """Score two folders or two videos; write a CSV file with a row for each pair to ``out``."""
+    """Score two folders or two videos; write a CSV file with a row for each pair to ``out``.
+
+    The exit code is that of missing data if no metric has a value.
+    """
     if renders.resolve() == truth.resolve():
         raise InputError("command line", "--truth", "another folder or file than the renders", str(truth))
     if out is not None:
@@ -318,9 +321,9 @@ def score_pairs(
     keys = [pair.key for pair in pairs]
     frames = ScoredFrames(images.render, images)
     score_frames(keys[:1], frames, specs, device=device)  # finds wrong files of networks before long work
-    scored = score_frames(keys, frames, specs, regions, progress, device)
+    scores = score_frames(keys, frames, specs, regions, progress, device)
     columns = [
-        _Column(spec, region, {s.key: s for s in scored[spec.name] if s.region == region})
+        _Column(spec, region, {s.key: s for s in scores[spec.name] if s.region == region})
         for spec in specs
         for region in (FULL, *(regions if spec.kind == "regional" else ()))
     ]
@@ -346,7 +349,9 @@ def score_pairs(
     text, means = _means(pairs, columns, renders.name, protocol.pooled if protocol else None)
     about = f"{renders} against {truth}: {counted(len(pairs), 'pair')}."
     data = {"pairs": len(pairs), **means, "resize": resize, "out": out, "protocol": list(protocols)}
-    return CommandResult("\n\n".join([text, "\n".join([about, *notes])]), data)
+    scored = any(column.values(pairs) for column in columns)
+    code = ExitCode.OK if scored else ExitCode.NO_VERDICT
+    return CommandResult("\n\n".join([text, "\n".join([about, *notes])]), data, scored, code)
 
 
 def _protocol(names: Sequence[str], metrics: Sequence[str]) -> NamedProtocol | None:

@@ -87,6 +87,14 @@ def test_a_broken_plugin_is_listed_and_raises_when_asked_for(monkeypatch, toy, t
         registry.get("metrics", "goood")
 
 
+def test_of_many_names_the_nearest_are_shown():
+    known = [f"metric-{number}" for number in range(40)]
+    error = str(registry.unknown("file", "name", "metric-399", known))
+    assert "expected one of metric-39, " in error
+    assert "or 35 others, found 'metric-399'" in error
+    assert "one of metric-0, metric-1, found" in str(registry.unknown("file", "name", "x", known[:2]))
+
+
 def test_the_first_party_wins_a_clash_of_names(monkeypatch, toy, caplog):
     other, own = entry("psnr", "toy_plugin:NOT_HERE"), entry("psnr", "toy_plugin:ERROR")
     monkeypatch.setattr(registry, "_origin", lambda e: "headbench" if e is own else "other")

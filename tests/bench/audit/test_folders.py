@@ -102,6 +102,12 @@ def test_the_table_has_means_and_says_what_is_missing(folders, capsys):
     assert "3 renders as JPEG or video" in text
 
 
+def test_the_exit_code_tells_that_nothing_was_scored(folders, capsys):
+    words = ["evaluate", "renders", "--truth", "truth", "--metrics", "toy_plugin:NOT_HERE"]
+    assert cli.main(words) == 3
+    assert "3 of 3 pairs" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("method", ["area", "bicubic"])
 def test_renders_are_resized_to_the_truth(folders, capsys, method):
     large = picture(48, 64)
