@@ -3,16 +3,32 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import tyro
 
 from ..condition import Condition, Named
-from ..contracts import Avatar, Clip, DepthAvatar, FloatArray, FrameKey, HeadPose, Progress, no_progress
+from ..contracts import (
+    Avatar,
+    Camera,
+    Clip,
+    DepthAvatar,
+    FloatArray,
+    Frame,
+    FrameKey,
+    HeadPose,
+    Progress,
+    TrueFrame,
+    no_progress,
+)
+from ..engine.adaptation import MethodNeeds, apply
+from ..engine.adaptation import plan as plan_adaptation
 from ..engine.config import RunOptions, with_methods
 from ..engine.plan import Job, trained
 from ..engine.run import run
@@ -33,6 +49,7 @@ from .stability import (
     LimitCheck,
     Measures,
     ShownFrames,
+    absent_surface,
     judge,
     judged_rows,
     protocols_of,
@@ -351,7 +368,7 @@ class ExtremesPlan:
 
 def protocols(jobs: Sequence[Job], **parameters: Any) -> dict[str, Protocol]:
     """The protocols of the registered change "extremes"."""
-    return protocols_of(TASK, [_shown(job, ExtremesPlan.of(job.form.clip, **parameters)) for job in jobs])
+    return protocols_of(TASK, [_shown(job, ExtremesPlan.of(job.clip, **parameters)) for job in jobs])
 
 
 def drive(job: Job, avatar: Avatar, progress: Progress, **parameters: Any) -> tuple[Rows, dict[str, Any]]:
@@ -359,7 +376,7 @@ def drive(job: Job, avatar: Avatar, progress: Progress, **parameters: Any) -> tu
 
     The details are the record of the avatar: views, frames, ground truth and results.
     """
-    plan = ExtremesPlan.of(job.form.clip, **parameters)
+    plan = ExtremesPlan.of(job.clip, **parameters)
     keys = _shown(job, plan).keys
     rows, record = judged_rows(job, keys, lambda: _judged(job, avatar, plan, progress))
     return Rows.of(rows), {"avatars": [record]}
@@ -385,8 +402,66 @@ def _truth(job: Job) -> tuple[TruthPictures | None, str]:
         return None, str(error)
 
 
+def _surface(avatar: Avatar, given: GivenFrame, truth: TrueFrame) -> list[LimitCheck]:
+    """Errors of depth and normals, for an avatar that gives depth in images of the truth's size."""
+    height, width = truth.mask.shape
+    camera = given.camera
+    if camera.width * height != camera.height * width:
+        return absent_surface("the method renders images of another shape")
+    camera = camera.resized(width, height)
+    depth = avatar.depth(camera, given.pose) if isinstance(avatar, DepthAvatar) else None
+    return surface(depth, truth, camera)
+
+
 def _key(job: Job, plan: ExtremesPlan, frame: PlannedFrame) -> FrameKey:
     return FrameKey(job.clip.subject, frame.name, frame.number, plan.views[frame.view].camera.id)
+
+
+class GivenFrame(NamedTuple):
+    """A planned frame as the method renders it."""
+
+    camera: Camera
+    pose: HeadPose
+    restore: Callable[[FloatArray], FloatArray]
+    """Maps an (H, W, 3) float image in this camera to the plan's."""
+
+    def restored(self, frame: Frame) -> Frame:
+        """The frame at the plan's size; what the method's image does not show is background without coverage."""
+        alpha = np.repeat(np.asarray(frame.alpha, np.float32)[..., None], 3, axis=2)
+        covered = self.restore(alpha) - self.restore(np.zeros_like(alpha))
+        return Frame(self.restore(np.asarray(frame.rgb, np.float32)), covered[..., 0])
+
+
+def given_frames(job: Job, plan: ExtremesPlan) -> list[GivenFrame]:
+    """The frames of a plan, adapted to the job's method as its clip is: to another head model, image size, or one video."""
+    if job.adapted is None:
+        return [GivenFrame(plan.views[f.view].camera, f.pose, lambda image: image) for f in plan.frames]
+    from ...datasets.clip import FrameFiles, as_capture
+
+    poses = list({id(frame.pose): frame.pose for frame in plan.frames}.values())
+    number = {id(pose): timestep for timestep, pose in enumerate(poses)}
+    keys = [_key(job, plan, frame)._replace(timestep=number[id(frame.pose)]) for frame in plan.frames]
+    planned = as_capture(job.clip).derive(
+        TASK,
+        {"plan": plan.fingerprint},
+        cameras={view.camera.id: view.camera for view in plan.views},
+        poses={timestep: replace(pose, timestep=timestep) for timestep, pose in enumerate(poses)},
+        splits={"train": (), "novel_view": tuple(keys), "self_reenactment": ()},
+        files=dict.fromkeys(keys, FrameFiles(None, None)),
+        excluded={},
+    )
+    needs = MethodNeeds.of(job.method.spec)
+    assert job.config is not None
+    adaptation = plan_adaptation(planned, needs, job.config.heads)
+    assert adaptation is not None  # as for the job's clip
+    with TemporaryDirectory() as folder:
+        form = apply(adaptation, needs, Path(folder), f"adapting {TASK} of {job.clip.subject}")
+    given = []
+    for key in keys:
+        own = form.key(key)
+        pose = replace(form.clip.poses[own.timestep], timestep=None)
+        given.append(GivenFrame(form.clip.cameras[own.camera], pose, partial(form.restore, key)))
+    return given
 
 
 def _judged(
@@ -405,11 +480,12 @@ def _judged(
     against: list[tuple[list[LimitCheck], list[LimitCheck]]] = []
     shown = []
     pose, splats = None, None
-    for index, frame in enumerate(plan.frames):
+    for index, (frame, given) in enumerate(zip(plan.frames, given_frames(job, plan))):
         view = plan.views[frame.view]
         if frame.pose is not pose:
-            pose, splats = frame.pose, splats_of(avatar, frame.pose)
-        rendered, measures = render_measured(avatar, view.camera, frame.pose, background, splats)
+            pose, splats = frame.pose, splats_of(avatar, given.pose)
+        own, measures = render_measured(avatar, given.camera, given.pose, background, splats)
+        rendered = given.restored(own)
         measured.append(measures)
         sample, follows = frame.name not in (TYPICAL, PATH), frame.name == PATH and frame.number > 0
         stem = f"{PATH}-{frame.number:02d}" if frame.name == PATH else frame.name
@@ -426,9 +502,7 @@ def _judged(
             entry["truth"] = mask[0].relative_to(job.run).as_posix()
             compared.append(TruthPair.of(rendered, truth))
             checks = scores.appearance(compared[-1], extrapolated=view.extrapolated)
-            small = truths.view(view.camera)
-            depth = avatar.depth(small, frame.pose) if isinstance(avatar, DepthAvatar) else None
-            checks += surface(depth, truth, small)
+            checks += _surface(avatar, given, truth)
             response = scores.response(compared[-1], compared[frame.view])
             flicker = scores.flicker(compared[-1], compared[-2 if follows else -1])
         against.append((checks, [*([response] if sample else []), *([flicker] if follows else [])]))

@@ -58,23 +58,22 @@ TRUTH_LIMITS = TruthLimits()
 class TruthPictures:
     """Renders of a `GroundTruth`, cached in a folder under names derived from their content.
 
-    Methods share them. ``height`` is their height in pixels: methods that use larger images are compared at the
-    capture's size.
+    Methods share them, in the poses and views of the capture.
     """
 
-    def __init__(self, source: GroundTruth, folder: Path, height: int) -> None:
-        self._source, self._folder, self._height = source, folder, height
+    def __init__(self, source: GroundTruth, folder: Path) -> None:
+        self._source, self._folder = source, folder
 
     @classmethod
     def of(cls, job: Job) -> TruthPictures:
-        """The ground truth of a cell's subject in the head model of its method. Raises `UnavailableError` if there is none."""
-        clip = job.form.clip
+        """The ground truth of a cell's subject. Raises `UnavailableError` if there is none."""
+        clip = job.clip
         place = f"truth of {clip.fingerprint}"
         if place not in job.kept:
             from ...datasets.synthetic.renderer import SyntheticTruth
 
             job.kept[place] = SyntheticTruth(clip)
-        return cls(job.kept[place], job.run / FOLDER, next(iter(job.clip.cameras.values())).height)
+        return cls(job.kept[place], job.run / FOLDER)
 
     @property
     def fingerprint(self) -> str:
@@ -83,36 +82,31 @@ class TruthPictures:
 
     def missing(self, frames: Iterable[tuple[Camera, HeadPose]]) -> int:
         """Number of frames whose renders are not in the folder."""
-        files = {self._files(self.view(camera), pose) for camera, pose in frames}
+        files = {self._files(camera, pose) for camera, pose in frames}
         return sum(not (picture.exists() and mask.exists()) for picture, mask in files)
 
     def at(self, camera: Camera, pose: HeadPose) -> tuple[TrueFrame, tuple[Path, Path]]:
         """The ground truth of a frame, rendered if it is not in the folder, and its files: image, mask and face."""
-        view = self.view(camera)
-        files = picture, masks = self._files(view, pose)
+        files = picture, masks = self._files(camera, pose)
         try:
             mask, face, _ = np.moveaxis(read_png(masks), 2, 0)
             truth = TrueFrame(read_png(picture), mask, face > 0)
         except InputError:  # missing or damaged
-            truth = self._source.render(view, pose)
+            truth = self._source.render(camera, pose)
             layers = [truth.mask, 255 * truth.face.astype(np.uint8), np.zeros_like(truth.mask)]
             write_png(picture, truth.rgb, SYNTHETIC)
             write_png(masks, np.stack(layers, axis=2), SYNTHETIC)
-        return truth._replace(depth=self._source.depth(view, pose)), files
+        return truth._replace(depth=self._source.depth(camera, pose)), files
 
-    def view(self, camera: Camera) -> Camera:
-        """A camera at the size of the renders."""
-        return camera.resized(round(camera.width * self._height / camera.height), self._height)
-
-    def _files(self, view: Camera, pose: HeadPose) -> tuple[Path, Path]:
-        given = (view.K, view.world_to_camera, *(getattr(pose, name) for name in POSE_FIELDS))
+    def _files(self, camera: Camera, pose: HeadPose) -> tuple[Path, Path]:
+        given = (camera.K, camera.world_to_camera, *(getattr(pose, name) for name in POSE_FIELDS))
         shown = [np.asarray(values, np.float64) for values in given if values is not None]
-        name = digest(self.fingerprint, view.width, view.height, pose.head_model, *shown)[:20]
+        name = digest(self.fingerprint, camera.width, camera.height, pose.head_model, *shown)[:20]
         return self._folder / f"{name}.png", self._folder / f"{name}-mask.png"
 
 
 class TruthPair(NamedTuple):
-    """A rendered frame at the size of the truth: (H, W, 3) 8-bit sRGB and (H, W) alpha."""
+    """A rendered frame of the truth's size: (H, W, 3) 8-bit sRGB and (H, W) alpha."""
 
     picture: ByteArray
     alpha: FloatArray
@@ -124,12 +118,6 @@ class TruthPair(NamedTuple):
         rgb, alpha = np.asarray(frame.rgb, np.float32), np.asarray(frame.alpha, np.float32)
         if not (np.isfinite(rgb).all() and np.isfinite(alpha).all()):
             return None
-        height, width = truth.mask.shape
-        if alpha.shape != (height, width):
-            rgb, alpha = (
-                np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-                for values in (rgb, alpha)
-            )
         return cls(quantise(rgb), alpha, truth)
 
 

@@ -13,11 +13,13 @@ from headbench.bench.engine.config import RunConfig, resolve_cells
 from headbench.bench.engine.plan import make_jobs
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.experiments import extremes
-from headbench.bench.experiments.extremes import ExtremesSettings
+from headbench.bench.experiments.extremes import ExtremesPlan, ExtremesSettings, GivenFrame
 from headbench.bench.experiments.refit import FrameFit, refit
 from headbench.bench.experiments.truth import TRUTH_LIMITS, TruthJudge, TruthPair, TruthPictures
 from headbench.bench.experiments.viewpoints import head_center
 from headbench.bench.io.images import quantise
+from headbench.datasets.head.geometry import project
+from headbench.datasets.head.model import PosedSubject
 from headbench.datasets.open import open_clip
 from headbench.datasets.synthetic.capture import synthesize
 from headbench.reports.contact_sheet import SHEET_FILE, table, write_extremes_sheet
@@ -139,18 +141,26 @@ FRAMES, SAMPLES = 2 + 2 * 2 + 2, 2 * 2
 
 
 @pytest.fixture(scope="module")
-def job(tmp_path_factory):
-    """A cell of a small synthetic capture; its truth is rendered once for all avatars."""
+def jobs(tmp_path_factory):
+    """Cells of a small synthetic capture by method: `gbs` is given the clip in another head model, as one video."""
     root = tmp_path_factory.mktemp("truth")
     how = {"performance": "full", "workers": 1, "tracking_error": 1.0, "samples_per_pixel": 4}
     with flat_pictures():  # of which the truth needs none
         (capture,) = synthesize(root / "data", cameras=3, timesteps=8, size=(32, 46), **how)
     condition = Condition(drive=Named("extremes", PARAMETERS))
     config = RunConfig(
-        data=str(root / "data"), out=str(root / "run"), methods=("mean-image",), conditions=(condition,)
+        data=str(root / "data"), out=str(root / "run"), methods=("mean-image", "gbs"), conditions=(condition,)
     )
-    (job,) = make_jobs(config, resolve_cells(config), [open_clip(capture)], {}, RunFolder(root / "run"))
-    return replace(job, protocols=extremes.protocols([job], **PARAMETERS))
+    found = make_jobs(config, resolve_cells(config), [open_clip(capture)], {}, RunFolder(root / "run"))
+    return {
+        job.method.spec.name: replace(job, protocols=extremes.protocols([job], **PARAMETERS)) for job in found
+    }
+
+
+@pytest.fixture(scope="module")
+def job(jobs):
+    """A cell whose truth is rendered once for all avatars."""
+    return jobs["mean-image"]
 
 
 class TrueAvatar:
@@ -176,6 +186,54 @@ def driven(job, *given, **settings):
         "avatars"
     ]
     return record
+
+
+class InOrder(TrueAvatar):
+    """Returns the truth of the planned frames, whatever it is given, which it keeps."""
+
+    def __init__(self, job):
+        super().__init__(job)
+        self._plan, self.given = ExtremesPlan.of(job.clip, **PARAMETERS), []
+
+    def render(self, camera, pose, background=(1.0, 1.0, 1.0)):
+        frame = self._plan.frames[len(self.given)]
+        self.given.append((camera, pose))
+        return super().render(self._plan.views[frame.view].camera, frame.pose)
+
+    def depth(self, camera, pose):
+        return np.ones((camera.height, camera.width), np.float32)
+
+
+def test_a_method_of_another_head_model_has_the_same_frames(jobs):
+    """Its poses and cameras show the face where those of the plan do."""
+    job = jobs["gbs"]
+    ((own,), (others,)) = (each.protocols.values() for each in (job, jobs["mean-image"]))
+    assert own.hash == others.hash
+    avatar = InOrder(job)
+    (record,) = extremes.drive(job, avatar, no_progress, **PARAMETERS)[1]["avatars"]
+    assert "no_truth" not in record
+    assert record["measures"]["psnr face"]["worst"] == 100.0
+    assert record["frames"] == FRAMES == len(avatar.given)
+    plan = ExtremesPlan.of(job.clip, **PARAMETERS)
+    for (camera, pose), frame in zip(avatar.given, plan.frames):
+        assert pose.head_model == job.form.clip.head.version != job.clip.head.version
+        assert pose.timestep is None
+        assert not np.any([pose.rotation, pose.translation])
+        shown = [(job.form.clip, camera, pose), (job.clip, plan.views[frame.view].camera, frame.pose)]
+        mine, planned = (
+            project(PosedSubject.of(clip).meshes([p])[0][clip.head.regions["face"]], c)
+            for clip, c, p in shown
+        )
+        assert np.linalg.norm(mine - planned, axis=1).mean() < 0.1  # pixels
+
+
+def test_what_a_method_does_not_show_has_no_coverage():
+    given = GivenFrame(
+        None, None, lambda image: np.pad(image[1:-1], ((1, 1), (0, 0), (0, 0)), constant_values=1)
+    )
+    frame = given.restored(Frame(np.full((4, 3, 3), 0.5, np.float32), np.full((4, 3), 0.25, np.float32)))
+    np.testing.assert_array_equal(frame.alpha[:, 0], [0, 0.25, 0.25, 0])
+    np.testing.assert_array_equal(frame.rgb[:, 0, 0], [1, 0.5, 0.5, 1])
 
 
 def noise(rgb, alpha):
@@ -254,16 +312,15 @@ def test_pictures_are_rendered_once_and_again_if_damaged(tmp_path):
     truths = TruthPictures(
         SimpleNamespace(fingerprint="a", render=render, depth=lambda camera, pose: np.ones((10, 8))),
         tmp_path,
-        10,
     )
-    camera = Camera("c", 16, 20, np.diag([20.0, 20.0, 1.0]), np.eye(4))
+    camera = Camera("c", 8, 10, np.diag([20.0, 20.0, 1.0]), np.eye(4))
     pose = SimpleNamespace(head_model="m", expression=np.zeros(3), jaw=np.zeros(3), eyelids=None)
     pose = SimpleNamespace(**vars(pose), rotation=None, neck=None, eyes=None, translation=None)
     assert truths.missing([(camera, pose), (camera, pose)]) == 1
     first, files = truths.at(camera, pose)
     assert truths.missing([(camera, pose)]) == 0
     second, same = truths.at(replace(camera, id="another"), pose)
-    assert asked == [(8, 10)]  # at the capture's size
+    assert asked == [(8, 10)]
     assert files == same
     assert all(np.array_equal(a, b) for a, b in zip(first, second))
     pose.jaw = np.array([0.1, 0.0, 0.0])
@@ -337,12 +394,11 @@ def test_overlap_and_colour_are_those_counted_by_hand(judge):
     )
 
 
-def test_frames_are_brought_to_the_size_of_the_truth_if_finite(judge, pair):
+def test_frames_that_are_not_finite_are_not_compared(judge, pair):
     rgb = np.full((40, 40, 3), np.nan, np.float32)
     assert TruthPair.of(Frame(rgb, np.ones((40, 40), np.float32)), pair[0]) is None
     assert {check.value for check in judge.appearance(None)} == {None}
     assert judge.response(None, None).outcome == ("missing", "the frame is not finite")
-    large = np.repeat(np.repeat(pair[0].rgb / 255.0, 2, axis=0), 2, axis=1)
-    found = TruthPair.of(Frame(np.float32(large), np.ones((80, 80), np.float32)), pair[0])
+    assert TruthPair.of(Frame(np.ones_like(rgb), rgb[..., 0]), pair[0]) is None
+    found = TruthPair.of(Frame(np.float32(pair[0].rgb / 255.0), np.ones((40, 40), np.float32)), pair[0])
     assert np.array_equal(found.picture, pair[0].rgb)
-    assert found.alpha.shape == (40, 40)
