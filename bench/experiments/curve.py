@@ -263,6 +263,9 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
     name = "curve" if settings.over == "budget" else f"curve-{settings.over.replace('_', '-')}"
     out = Path(settings.out) if settings.out else source.root / name
     check_kind(out, "a run")
+    if (out / "run.json").is_file() if settings.until_flat else any(out.glob("*/run.json")):
+        expected = f"a new folder, or a curve {'with' if settings.until_flat else 'without'} --until-flat"
+        raise InputError(out, "--out", expected, f"one {'without' if settings.until_flat else 'with'} it")
     wanted = _wanted(settings, source)
     with locked(out):
         config, opened = open_run_clips(source.root, settings, out=out)
@@ -279,6 +282,11 @@ def curve_run(settings: CurveSettings, progress: Progress = no_progress) -> Comm
         )
         clips: list[Clip] = [hold_out(clip, config, **held.parameters) for clip in opened]
         tasks = tuple(task for task in (CAMERA, TIMESTEPS) if all(task in clip.splits for clip in clips))
+        if not tasks:
+            raise InputError(settings.run, "--test", "captures with test frames of one task", "none")
+        if settings.until_flat and TIMESTEPS not in tasks:
+            expected = "scored frames of training cameras, whose gain ends a curve"
+            raise InputError(settings.run, "--until-flat", expected, f"frames of {CAMERA} alone")
         config = replace(config, tasks=tasks)
         planned = tuple(conditions(settings, wanted, clips))
 
@@ -385,6 +393,10 @@ def _wanted(settings: CurveSettings, source: RunFolder) -> list[ResolvedMethod]:
     ]
     if not wanted:
         raise InputError(source.manifest, "methods", "a method that is no trivial baseline", names)
+    for name in iterations(settings.iterations):
+        if name not in _names(wanted):
+            expected = f"methods that are trained: {', '.join(_names(wanted))}"
+            raise InputError("command line", "--iterations", expected, name)
     for method in wanted:
         if method.budget == Budget():
             key, expected = f"budget of {method.spec.name}", "iterations or seconds, to train with a part of"

@@ -119,6 +119,12 @@ class SuiteSettings(ExecutionOptions):
         for name, least in (("repeated", 0), ("extremes", 0), ("first", 1)):
             if getattr(self, name) < least:
                 raise InputError("command line", f"--{name}", f"at least {least}", str(getattr(self, name)))
+        for name in ("methods", "seeds"):
+            values = getattr(self, name)
+            if len(set(values)) != len(values):
+                raise InputError("command line", f"--{name}", "each once", ", ".join(map(str, values)))
+        if min(self.seeds, default=0) < 0:
+            raise InputError("command line", "--seeds", "whole numbers from 0", str(min(self.seeds)))
         if self.first > self.subjects:
             raise InputError(
                 "command line", "--first", f"at most --subjects, {self.subjects}", str(self.first)
@@ -179,10 +185,11 @@ def suite(settings: SuiteSettings, progress: Progress = no_progress) -> CommandR
             rows = run(of_subject, execution).rows
             done.append(Path(of_subject.out))
             failed += rows.failed
-            trained = any(not method.spec.trivial for method in resolve_methods(config))
+            specs = [method.spec for method in resolve_methods(config)]
+            trained = tuple(spec.name for spec in specs if not spec.trivial and spec.name not in rows.failed)
             if base == RUN and trained and place < settings.extremes:
                 how = {name: getattr(settings, name) for name in ("executor", "workers", "set")}
-                extremes_run(ExtremesSettings(of_subject.out, **how), progress)
+                extremes_run(ExtremesSettings(of_subject.out, methods=trained, **how), progress)
             ends.append(closing(done[-1], rows))
         write_text(out / "results.md", suite_report(out, OURS))
     data = {"out": out, "runs": done, "failed": sorted({*failed})}

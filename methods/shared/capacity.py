@@ -84,6 +84,8 @@ def picture_motion(clip: Clip, mesh: SubjectMesh, pixel: float) -> PictureMotion
     for key in sorted(clip.splits["train"], key=lambda key: (key.timestep, key.camera)):
         rows.setdefault(key.timestep, []).append(key)
     timesteps = evenly_with_ends(sorted(rows), TIMESTEPS)
+    used = evenly_with_ends(sorted({key.camera for timestep in timesteps for key in rows[timestep]}), CAMERAS)
+    timesteps = [timestep for timestep in timesteps if any(key.camera in used for key in rows[timestep])]
     if len(timesteps) < LEAST_TIMESTEPS:
         return None
     poses = [clip.poses[timestep] for timestep in timesteps]
@@ -96,7 +98,6 @@ def picture_motion(clip: Clip, mesh: SubjectMesh, pixel: float) -> PictureMotion
     columns = columns[face] / pixel
     scale = np.sqrt((columns**2).sum(axis=1).mean(axis=0))
     columns = columns / np.maximum(scale, 1e-12)
-    used = evenly_with_ends(sorted({key.camera for timestep in timesteps for key in rows[timestep]}), CAMERAS)
     samples = _Samples(clip, mesh, used, rest, face, pixel)
     for timestep, pose in zip(timesteps, means):
         samples.add(pose, [key for key in rows[timestep] if key.camera in used])

@@ -158,6 +158,10 @@ def points_text(curve: CurveData, failed: Sequence[str]) -> str:
         title = f"Quality, held-out {held_out(task)}"
         lines += [table([*place, *(spec.label for spec in frame)], rows, names=3, title=title), ""]
     lines.append(f"Means over subjects. {curve.frames}")
+    trained = Counter((p.method, str(p.part), p.place) for p in curve.points if p.subject in curve.subjects)
+    for (method, part, _), count in trained.items():
+        if count < len(curve.subjects):
+            lines.append(f"left out: {method} {part}, trained on {count} of {len(curve.subjects)} subjects")
     for subject in curve.subjects if not curve.of_test else ():
         parameters = curve.held_out[subject]
         timesteps = parameters["timesteps"]
@@ -552,6 +556,7 @@ def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> No
     first = runs[0].manifest
     frames: dict[tuple[str, str], set[FrameKey]] = {}
     versions: dict[str, str] = {}
+    trainings: dict[str, MethodRecord] = {}
     for run in runs:
         place, other = run.folder.manifest, run.manifest
         for name in ("device", "preset", "divide", "seeds"):
@@ -567,6 +572,11 @@ def _check_together(runs: Sequence[RunData], points: Sequence[CurvePoint]) -> No
             version = versions.setdefault(record.name, record.version)
             if record.version != version:
                 raise InputError(place, f"version of {record.name}", version, record.version)
+            same = trainings.setdefault(record.label, record)
+            for name in ("budget", "config"):
+                expected, value = (str(getattr(each, name)) for each in (same, record))
+                if value != expected:
+                    raise InputError(place, f"{name} of {record.label}", expected, value)
         if run.tasks != runs[0].tasks:
             raise InputError(place, "tasks", ", ".join(runs[0].tasks), ", ".join(run.tasks))
         for task, subject in product(run.tasks, run.rows.subjects):
@@ -616,7 +626,7 @@ def leaders_text(curve: CurveData, *, markdown: bool = True) -> str:
     rule = ["---"] * (1 + len(heads))
     shown = pipe_table([["", *heads], rule, *lines]) if markdown else table(["metric", *heads], lines)
     taken = "limit of seconds" if curve.over == "seconds" else curve.axis.lower()
-    crossings = "95 % interval of each crossing in brackets"
+    crossings = "in brackets, the costs around it at which the 95 % interval of the difference contains 0"
     if len(curve.subjects) < LEAST_SUBJECTS:
         crossings = f"without intervals, which need {LEAST_SUBJECTS} subjects"
     return (

@@ -267,6 +267,73 @@ def test_a_curve_ends_where_a_longer_training_is_worse(make_run, plugin, over):
     ]
 
 
+@pytest.mark.parametrize(
+    ("splits", "asked", "match"),
+    [
+        (("train",), {"test": True}, "--test: expected captures with test frames"),
+        (("train", "novel_view"), {"test": True, "until_flat": True}, "--until-flat: .* novel_view alone"),
+    ],
+)
+def test_missing_frames_are_noticed_before_a_training(make_run, plugin, monkeypatch, splits, asked, match):
+    run = make_run("curve_plugin:METHOD")
+    made = module.hold_out
+
+    def without(clip, *args, **how):
+        held = made(clip, *args, **how)
+        return replace(held, splits={name: held.splits[name] for name in splits})
+
+    monkeypatch.setattr(module, "hold_out", without)
+    with pytest.raises(InputError, match=match):
+        curve_run(settings(run, **asked))
+    assert not plugin.FITS
+
+
+def test_a_folder_has_one_run_or_one_for_each_part(make_run, plugin):
+    run = make_run("curve_plugin:METHOD")
+    for kind, other in ((True, False), (False, True)):
+        where = {"out": str(run / f"curve-{kind}"), "fractions": ("1",)}
+        curve_run(settings(run, until_flat=kind, **where))
+        with pytest.raises(InputError, match="--out: expected a new folder"):
+            curve_run(settings(run, until_flat=other, **where))
+    assert len(plugin.FITS) == 2
+
+
+def test_iterations_are_of_methods_that_are_trained(make_run, plugin):
+    run = make_run("curve_plugin:METHOD", "curve_plugin:TIMED")
+    with pytest.raises(
+        InputError, match="--iterations: expected methods that are trained: timed, found noting"
+    ):
+        curve_run(settings(run, methods=("timed",), iterations=("noting=100",)))
+    assert not plugin.FITS
+
+
+@pytest.fixture
+def joined(make_run, tmp_path):
+    """Joins curves of two subjects, the second with other settings."""
+
+    def join(**changes):
+        places = []
+        for subject, how in (("ball-a", {}), ("ball-bee", changes)):
+            run = make_run("curve_plugin:METHOD", subjects=(subject,), folder=tmp_path / subject)
+            curve_run(settings(run, **{"fractions": ("1", "1/4"), **how}))
+            places.append(str(run / "curve"))
+        return curve_runs(CurveReportSettings(tuple(places), str(tmp_path / "joined")))
+
+    return join
+
+
+def test_no_mean_is_over_trainings_of_other_lengths(joined):
+    with pytest.raises(InputError, match=r"budget of noting\+1: expected .*64.*, found .*4000"):
+        joined(iterations=("noting=4000",))
+
+
+def test_parts_that_a_subject_lacks_are_named(joined):
+    text = joined(fractions=("1", "1/8")).text
+    assert re.findall("left out: (.*)", text) == [
+        f"noting {part}, trained on 1 of 2 subjects" for part in ("1/8", "1/4")
+    ]
+
+
 def test_with_one_camera_timesteps_alone_are_held_out(plugin, tmp_path):
     clip = importlib.import_module("ball_plugin").BallClip(tmp_path / "ball-a")
     clip.splits["train"] = tuple(key for key in clip.splits["train"] if key.camera == "3")

@@ -51,8 +51,9 @@ def test_the_suite_makes_subjects_and_tables_by_region_and_part(tmp_path, capsys
 def asked(monkeypatch, tmp_path):
     """What a suite with some options makes: (arguments of the capture, configuration of the run) of each run, in order."""
 
-    def plan(*options):
-        captures, runs, driven = [], [], []
+    def plan(*options, failed=(), driven=None):
+        captures, runs = [], []
+        driven = [] if driven is None else driven
 
         def capture(out, **given):
             captures.append(given | {"out": out})
@@ -63,13 +64,15 @@ def asked(monkeypatch, tmp_path):
         monkeypatch.setattr(
             module,
             "run",
-            lambda config, execution: runs.append(config) or SimpleNamespace(rows=SimpleNamespace(failed=[])),
+            lambda config, execution: (
+                runs.append(config) or SimpleNamespace(rows=SimpleNamespace(failed=[*failed]))
+            ),
         )
         monkeypatch.setattr(module, "closing", lambda run, rows: "")
-        monkeypatch.setattr(module, "extremes_run", lambda settings, progress: driven.append(settings.run))
-        assert cli.main(["run", "suite", "--out", str(tmp_path / "s"), *options]) == 0
+        monkeypatch.setattr(module, "extremes_run", lambda settings, progress: driven.append(settings))
+        assert cli.main(["run", "suite", "--out", str(tmp_path / "s"), *options]) == bool(failed)
         exact = [run.out for run in runs if Path(run.out).parent.name == "run"]
-        assert driven == ([] if "--extremes" in options else exact)
+        assert [settings.run for settings in driven] == ([] if "--extremes" in options else exact)
         return list(zip(captures, runs, strict=True))
 
     return plan
@@ -116,6 +119,12 @@ def test_ablations_are_conditions_of_their_methods(asked, options, conditions):
     assert {condition.methods for condition in recorded.conditions[1:]} == (
         {("ours",)} if conditions else set()
     )
+
+
+def test_the_avatars_beside_a_failed_training_are_driven(asked):
+    driven = []
+    asked("--methods", "mean-image", "ga", "ours", "--subjects", "2", failed=["ga"], driven=driven)
+    assert [settings.methods for settings in driven] == [("ours",)] * 2
 
 
 def test_iterations_are_those_asked_for(asked):
@@ -200,6 +209,9 @@ def test_ablations_change_ours_and_additions_make_ours_plus():
         (["--methods", "ours", "ga-official"], "checkout"),
         (["--subjects", "2", "--first", "3"], "at most --subjects, 2"),
         (["--set", "preset=smoke"], "expected one of execution"),
+        (["--seeds", "0", "0"], "--seeds: expected each once, found 0, 0"),
+        (["--seeds", "-1"], "--seeds: expected whole numbers from 0, found -1"),
+        (["--methods", "ga", "ga"], "--methods: expected each once, found ga, ga"),
         (["--iterations", "ga=0"], "NAME=NUMBER, whole numbers from 1"),
         (["--methods", "ga", "--iterations", "gq=5"], "'gq'"),
         (["--methods", "ga", "--plan", "ga=5", "capture=5"], "microseconds of capture, frame, ga"),

@@ -18,6 +18,7 @@ from headbench.methods.gbs.method import GBS
 from headbench.methods.gbs.spec import BlendshapeTraining, GBSConfig
 from headbench.methods.ours.method import plan_capacity
 from headbench.methods.ours.spec import OursConfig, PlannedCapacity
+from headbench.methods.shared import capacity
 from headbench.methods.shared.avatar_files import clip_mesh
 from headbench.methods.shared.capacity import CONFIRMED, PictureMotion, picture_motion, with_sizes
 from headbench.methods.shared.config import Capacity, SplatTraining
@@ -124,6 +125,24 @@ def test_few_timesteps_are_decided_by_poses(full):
     short = replace(clip, splits={**clip.splits, "train": some})
     assert picture_motion(short, clip_mesh(short, "cpu"), 1e-3) is None
     assert kept(short)[0] > 0
+
+
+def test_timesteps_without_frames_of_read_cameras_are_left_out(full, monkeypatch):
+    """One frame of each timestep, of the cameras in turn."""
+    performer, _ = full
+    clip = performer.tracked()
+    first, second = sorted({key.camera for key in clip.splits["train"]})
+    turns = tuple(
+        key for key in clip.splits["train"] if key.camera == (first if key.timestep % 3 else second)
+    )
+    alternating = replace(clip, splits={**clip.splits, "train": turns})
+    mesh = clip_mesh(clip, "cpu")
+    with monkeypatch.context() as patch:
+        patch.setattr(capacity, "CAMERAS", 1)
+        found = picture_motion(alternating, mesh, 1e-3)
+    of_first = tuple(key for key in turns if key.camera == first)
+    expected = picture_motion(replace(clip, splits={**clip.splits, "train": of_first}), mesh, 1e-3)
+    assert np.array_equal(found.pictured, expected.pictured)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 100))
