@@ -2,8 +2,8 @@
 
 python docs/_ext/stored_results.py WHAT OUT .
 
-WHAT is demo, suite, profiles, faces or frames (a run of one subject), or further, mechanisms, curves or sizes (a folder of runs); OUT
-is the folder of the run or runs. A block of a page is between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``.
+WHAT is demo, suite, profiles, faces or frames (a run of one subject), or further, mechanisms, curves, further-curves, large-curves,
+sizes or scenes (a folder of runs); OUT is the folder of the run or runs. A block of a page is between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``.
 """
 
 import os
@@ -23,13 +23,15 @@ import readme_pictures
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError
 from headbench.bench.experiments.specs import MOVED_LINES, RECORD_FILE, RECORDED_RUN, RUN, SEEDS_RUN
+from headbench.bench.experiments.suite import HELD_OUT_CAMERAS
+from headbench.bench.io.documents import read_json
 from headbench.bench.io.files import write_json, write_text
 from headbench.bench.progress import counted
 from headbench.bench.protocol import SEEN_CAMERAS, TASK_TITLES, UNSEEN_CAMERAS
 from headbench.bench.registry import discover, get
 from headbench.bench.rows import FULL, Rows
-from headbench.reports.aggregate import summarise
-from headbench.reports.curve.curve import HELD_OUT, CurveData, CurvePoint, leaders_text, read_curve
+from headbench.reports.aggregate import OTHERS_LIMIT, summarise, whole_images
+from headbench.reports.curve.curve import HELD_OUT, CurveData, CurvePoint, Leader, leaders_text, read_curve
 from headbench.reports.papers import papers
 from headbench.reports.protocols import choice_effects
 from headbench.reports.runs import FrameSelection, RunData, RunSet
@@ -41,19 +43,24 @@ from headbench.reports.suite.suite import (
     planned_subjects,
     primary_table,
     read_extremes,
-    variance_section,
+    variance_table,
 )
 from headbench.reports.table_report import Columns, table_of
 from headbench.reports.tables import build_table
 from headbench.reports.writers import pipe_table, to_markdown, to_text
 
+PLANNED_FILE = "planned.json"
+SCENES = ("still", "speech", "full")
+"""Captures for which sizes are planned: without expressions, of speech, of all sequences."""
 NOVEL, FACE, DOCS = "novel_view", "face", "docs/explanation"
 OURS, REFERENCE = "ours", "ga"
 MOVED = f"{OURS}+{MOVED_LINES}"
 BESIDE = (OURS, MOVED, "ours-plus", "gbs")
 """Methods of the results page's differences from `REFERENCE`."""
-CURVED = (REFERENCE, "gbs", OURS, "ours-plus")
-"""Methods with a curve on every development subject."""
+CAMERAS = dict(zip(("frontal", "side", "low"), HELD_OUT_CAMERAS))
+"""The suite's unseen cameras by position."""
+ODD, OTHERS = "side", ("frontal", "low")
+"""The camera whose colours differ most from those of its neighbours on captures as recordings are, and the others of `CAMERAS`."""
 COLUMNS = (
     ("Face PSNR, novel views (dB) ↑", FACE, "psnr", NOVEL, 1),
     ("Face PSNR, new expressions (dB) ↑", FACE, "psnr", UNSEEN_CAMERAS, 1),
@@ -75,7 +82,7 @@ class StoredResults:
         self.run = cache(RunData.read)
         self.read = cache(lambda *folders: RunSet.joined(tuple(map(self.run, folders))))
         self.curve = cache(
-            lambda *methods: read_curve([*map(self.run, self.runs("curves"))], "budget", methods)
+            lambda *methods, of="curves": read_curve([*map(self.run, self.runs(of))], "budget", methods)
         )
 
     def runs(self, name: str) -> list[Path]:
@@ -105,6 +112,7 @@ class StoredResults:
         folders = self.runs("further")
         same = self.read(*folders, *(self.gallery / "suite" / RUN / run.name for run in folders))
         further, new = same.only(same.ranked).shared.by_camera, self.run(folders[0]).methods
+        scenes = {name: self.gallery / "scenes" / name for name in SCENES}
         beside = f"{main_table(further)}\n\n{psnr_differences(further, new, REFERENCE)}"
         columns = Columns((NOVEL, "psnr", "ssim", "lpips"), digits=("psnr=1", "ssim=3", "lpips=3"))
         printed = to_text(table_of(demo, columns=columns))
@@ -114,16 +122,21 @@ class StoredResults:
             ),
             ("README.md", "suite"): main_table(self.ranked),
             ("README.md", "findings"): findings(
-                self.recorded, self.curve(*CURVED), self.curve(OURS, REFERENCE)
+                self.recorded,
+                self.suite,
+                self.curve(),
+                self.curve(OURS, REFERENCE),
+                self.curve(of="large-curves"),
             ),
             (f"{DOCS}/results.md", "endpoints"): primary_table(self.recorded),
+            (f"{DOCS}/results.md", "cameras"): by_unseen_camera(self.recorded),
             (f"{DOCS}/results.md", "differences"): psnr_differences(self.recorded, BESIDE, REFERENCE),
             (f"{DOCS}/results.md", "exact"): psnr_differences(self.suite, BESIDE, REFERENCE, (FACE,)),
             (f"{DOCS}/results.md", "table-4"): moved_lines(self.recorded, self.suite),
-            (f"{DOCS}/results.md", "seeds"): variance_section(self.seeded, (OURS, REFERENCE)).partition(
-                "\n\n"
-            )[2],
-            (f"{DOCS}/results.md", "curves"): curve_table(self.curve(*CURVED), self.curve(OURS, REFERENCE)),
+            (f"{DOCS}/results.md", "seeds"): variance_table(self.seeded, (OURS, REFERENCE), of_methods=False),
+            (f"{DOCS}/results.md", "curves"): curve_table(self.curve(), self.curve(OURS, REFERENCE)),
+            (f"{DOCS}/methods/rgbavatar.md", "further-curves"): trainings(self.curve(of="further-curves")),
+            (f"{DOCS}/results.md", "large-curves"): trainings(self.curve(of="large-curves")),
             (f"{DOCS}/results.md", "sizes"): sizes({run.name: self.read(run) for run in self.runs("sizes")}),
             (f"{DOCS}/results.md", "extremes"): extremes(read_extremes(self.runs(f"suite/{RUN}"))),
             (f"{DOCS}/protocols.md", "protocols"): choices(self.recorded),
@@ -133,6 +146,12 @@ class StoredResults:
                 {folder.name: self.read(folder) for folder in self.runs("mechanisms")}
             ),
             (f"{DOCS}/methods/index.md", "matrix"): matrix(self.root / "docs"),
+            (f"{DOCS}/methods/ours.md", "planned"): planned(
+                {
+                    scene: (self.read(folder), read_json(folder / PLANNED_FILE))
+                    for scene, folder in scenes.items()
+                }
+            ),
             (f"{DOCS}/methods/rgbavatar.md", "further"): beside,
         }
 
@@ -178,9 +197,36 @@ def main_table(runs: RunSet) -> str:
     return f"{pipe_table(lines)}\n\nMeans over {subjects}, the best in bold; images of {how}."
 
 
-def findings(suite: RunSet, curve: CurveData, both: CurveData) -> str:
+def at_cameras(runs: RunSet, *positions: str) -> RunSet:
+    """The runs with the rows of some of `CAMERAS`."""
+    chosen = [CAMERAS[position] for position in positions]
+    frames = {
+        task: [frame for frame in runs.rows.frames(task, FULL) if frame[3] in chosen] for task in runs.tasks
+    }
+    return replace(runs, rows=runs.rows.of_frames(frames))
+
+
+def by_unseen_camera(runs: RunSet) -> str:
+    """PSNR of the face of `REFERENCE`, and the difference of `OURS` from it, at the camera `ODD` and at `OTHERS`."""
+    heads = [f"`{REFERENCE}`, novel view", f"`{OURS}` - `{REFERENCE}`, novel view"]
+    heads += [f"`{OURS}` - `{REFERENCE}`, self-reenactment"]
+    lines = [["Unseen cameras, PSNR of the face (dB)", *heads], ["---", *["--:"] * len(heads)]]
+    for positions in ((ODD,), OTHERS):
+        at = at_cameras(runs, *positions)
+        found = [comparison(at, (OURS, REFERENCE), task, "psnr", FACE) for task in (NOVEL, UNSEEN_CAMERAS)]
+        value = summarise(at.of(FrameSelection(FACE)).rows, REFERENCE, "psnr", NOVEL).value
+        lines.append([" and ".join(positions), f"{value:.1f}", *(each.text(1) for each in found)])
+    return pipe_table(lines)
+
+
+def in_the_face(runs: RunSet, pair: tuple[str, str], *, intervals: bool = True) -> str:
+    """Difference of a pair in PSNR of the face at unseen cameras, in novel views and in new expressions."""
+    found = [comparison(runs, pair, task, "psnr", FACE) for task in (NOVEL, UNSEEN_CAMERAS)]
+    return " and ".join(each.text(1) if intervals else f"{each.difference:+.1f}" for each in found)
+
+
+def findings(suite: RunSet, exact: RunSet, curve: CurveData, both: CurveData, large: CurveData) -> str:
     """Sentences on the endpoints, the crossing of Table 4, and the training time; ``both`` is the curve of the pair alone."""
-    trainings = [summarise(suite.rows, name, "training_processor", "").value for name in suite.ranked]
     pair, moved = (OURS, REFERENCE), (MOVED, OURS)
     novel, new = (comparison(suite, pair, task, "psnr", FACE) for task in (NOVEL, UNSEEN_CAMERAS))
     novel_moved, new_moved = (
@@ -188,21 +234,39 @@ def findings(suite: RunSet, curve: CurveData, both: CurveData) -> str:
     )
     planned = planned_subjects(suite)
     interim = f"; interim, {planned} are planned" if novel.subjects < planned else ""
-    over = f"means over {counted(novel.subjects, 'subject')}" + " with 95 % intervals" * (
-        novel.subjects >= LEAST_SUBJECTS
-    )
-    longest = max(point.cost[curve.clock] or 0.0 for point in curve.means)
+    over = counted(novel.subjects, "subject") + ", 95 % intervals" * (novel.subjects >= LEAST_SUBJECTS)
+    longest, largest = (max(p.cost[each.clock] or 0.0 for p in each.means) for each in (curve, large))
     after = [best_at(curve, seconds) for seconds in (60.0, longest)]
     also = "too" if after[0] == after[1] else f"that of {after[1]}"
-    crossing = "; ".join(each.text() for each in both.best[f"psnr_{FACE}", NOVEL])
+    odd, others = (
+        in_the_face(at_cameras(suite, *names), pair, intervals=False) for names in ((ODD,), OTHERS)
+    )
+    crossing = turns(both.best[f"psnr_{FACE}", NOVEL])
     return f"""\
-- In the face at cameras without training images, `{OURS}` minus `{REFERENCE}` is {novel.text(1)} dB in novel views and {new.text(1)} dB \
-in new expressions ({over}{interim}), with about {fmean(trainings):.0f} processor seconds of training.
+- In the face at unseen cameras, `{OURS}` minus `{REFERENCE}` is {novel.text(1)} dB in novel views and {new.text(1)} dB \
+in new expressions ({over}{interim}): \
+{odd} dB at the {ODD} camera, which has other colours than its neighbour, {others} dB at the other two. On exact captures it is {in_the_face(exact, pair)} dB. `ours-plus` minus `gbs` is {in_the_face(suite, ("ours-plus", "gbs"))} dB.
 - Lines that move splats (`{MOVED}`) instead of changing their opacity change novel views by {novel_moved.text(1)} dB and new \
-expressions by {new_moved.text(1)} dB in the face; in Table 4 of the paper of `{OURS}` by +1.2 and -0.7 dB.
-- After one minute of training on one processor the best face is that of {after[0]}, after {longest / 60:.0f} minutes {also} \
-({counted(len(curve.subjects), "development subject")}, at most 20,000 splats; longer trainings are not measured). Of \
-`{OURS}` and `{REFERENCE}`, by seconds, in novel views: {crossing}."""
+expressions by {new_moved.text(1)} dB in the face; in Table 4 of its paper +1.2 and -0.7 dB.
+- After one minute on one processor the best face is that of {after[0]}, after {longest / 60:.0f} minutes {also} \
+({counted(len(curve.subjects), "development subject")}); at 550x802 with 60,000 splats, after {largest / 60:.0f} minutes, \
+that of {best_at(large, largest)}, on {counted(len(large.subjects), "subject")}. A night is not measured. Of \
+`{OURS}` and `{REFERENCE}`, in novel views {crossing}."""
+
+
+def turns(leading: Sequence[Leader]) -> str:
+    """Which method is better up to which processor seconds."""
+    first, *later = leading
+    text = f"`{first.method}` is better"
+    for each in later:
+        text += f" up to {each.start:.0f} s"
+        if each.interval is not None:
+            low, high = each.interval
+            ends = f"less than {each.compared[0]:.0f}" if low is None else f"{low:.0f}"
+            ends += f" to more than {each.compared[1]:.0f}" if high is None else f" to {high:.0f}"
+            text += f" (no significant difference from {ends} s)"
+        text += f", then `{each.method}`"
+    return text if later else f"{text} at all measured times"
 
 
 SPOKEN = {
@@ -344,18 +408,23 @@ def choices(runs: RunSet, suite: str = "the suite") -> str:
 
 
 def curve_table(curve: CurveData, pair: CurveData) -> str:
-    """PSNR of the face and processor seconds by method and length of training, and the best methods, of all and of a pair."""
+    """`trainings` of a curve with an explanation, and the best methods, of all and of a pair."""
+    of_face = [spec for spec in curve.metrics if spec.name == f"psnr_{FACE}"]
+    led = [leaders_text(replace(each, metrics=of_face)) for each in (curve, pair)]
+    names = " and ".join(f"`{name}`" for name in pair.by_method)
+    kinds = " / ".join(TASK_TITLES[task].lower() for task in curve.tasks)
+    head = f"PSNR of the face in dB, {kinds}, and processor seconds of the training; means over {len(curve.subjects)} subjects:"
+    return "\n\n".join([head, trainings(curve), led[0], f"Of {names} alone:", led[1].partition("\n\n")[2]])
+
+
+def trainings(curve: CurveData) -> str:
+    """PSNR of the face and processor seconds by method and length of training."""
     parts = sorted({point.part for point in curve.means})
     lines = [["Method", *(f"{part} of the longest" for part in parts)], ["---", *["---"] * len(parts)]]
     for method, points in curve.by_method.items():
         cells = {point.part: curve_cell(point, curve) for point in points}
         lines.append([f"`{method}`", *(cells.get(part, "ended") for part in parts)])
-    kinds = " / ".join(TASK_TITLES[task].lower() for task in curve.tasks)
-    head = f"PSNR of the face in dB, {kinds}, and processor seconds of the training; means over {counted(len(curve.subjects), 'subject')}:"
-    of_face = [spec for spec in curve.metrics if spec.name == f"psnr_{FACE}"]
-    led = [leaders_text(replace(each, metrics=of_face)) for each in (curve, pair)]
-    names = " and ".join(f"`{name}`" for name in pair.by_method)
-    return "\n\n".join([head, pipe_table(lines), led[0], f"Of {names} alone:", led[1].partition("\n\n")[2]])
+    return pipe_table(lines)
 
 
 def curve_cell(point: CurvePoint, curve: CurveData) -> str:
@@ -381,8 +450,28 @@ def sizes(runs: Mapping[str, RunSet]) -> str:
             metrics = {"storage": 2, "storage_coded": 2, "coded_change": 2, "latency_p50": 0}
             cells = [f"{summarise(face, name, 'psnr', task).value:.1f}" for task in (NOVEL, UNSEEN_CAMERAS)]
             cells += [f"{summarise(each.rows, name, m, '').value:.{n}f}" for m, n in metrics.items()]
+            loaded = whole_images(each.rows, name, "latency_p50", "")["other_cores"].max() > OTHERS_LIMIT
+            cells[-1] += "*" * bool(loaded)
             count = f"{summarise(each.rows, name, 'primitives', '').value:,.0f}"
             lines.append([f"{thousands},000", f"`{name}`", count, *cells])
+    return f"{pipe_table(lines)}\n\n\\* Timed while other programs used more than a core, not comparable with the other times."
+
+
+def planned(scenes: Mapping[str, tuple[RunSet, Mapping[str, Mapping[str, object]]]]) -> str:
+    """What `capacity.mode=auto` keeps of `OURS` by capture, and its bytes and PSNR of the face beside those of fixed sizes."""
+    (label,) = {label for _, sizes in scenes.values() for label in sizes}
+    names = list(dict.fromkeys(name for _, sizes in scenes.values() for name in sizes[label]))
+    heads = [f"`{name}`" for name in names]
+    lines = [["Capture", *heads, "MB, of fixed sizes", "Novel view, face (dB), of fixed sizes"]]
+    lines.append(["---", *["--:"] * (len(heads) + 2)])
+    for scene, (runs, sizes) in scenes.items():
+        face = runs.of(FrameSelection(FACE)).rows
+        kept = [str(sizes[label].get(name, "–")) for name in names]
+        both = [
+            ", ".join(f"{summarise(rows, each, metric, task).value:.2f}" for each in (label, OURS))
+            for rows, metric, task in ((runs.rows, "storage", ""), (face, "psnr", NOVEL))
+        ]
+        lines.append([scene, *kept, *both])
     return pipe_table(lines)
 
 
@@ -402,7 +491,7 @@ def extremes(avatars: Sequence[Mapping[str, Any]]) -> str:
         "frames over a limit",
     ]
     lines = [heads, ["---", *["--:"] * (len(heads) - 1)]]
-    finite = True
+    finite, worst = True, {}
     for method, own in by_method.items():
         measures = [avatar["measures"] for avatar in own]
         faces = [each["psnr face"] for each in measures if each["psnr face"]["mean"] is not None]
@@ -411,15 +500,18 @@ def extremes(avatars: Sequence[Mapping[str, Any]]) -> str:
         finite = finite and not broken
         face = ["–", "–"]
         if faces:
+            worst[method] = min(each["worst"] for each in faces)
             face = [
                 f"{fmean(each['mean'] for each in faces):.1f}",
-                f"{min(each['worst'] for each in faces):.1f}",
+                f"{worst[method]:.1f}",
             ]
         flicker = f"{fmean(steady):.2f}" if steady else "–"
         counts = [len(own), sum(avatar["frames"] for avatar in own), broken]
         over = sum(avatar["frames_broken"] for avatar in own)
         lines.append([f"`{method}`", *map(str, counts), *face, flicker, str(over)])
     said = "No avatar renders non-finite values." if finite else "Some avatars render non-finite values."
+    if worst:
+        said += f" The worst frame is one of `{min(worst, key=worst.__getitem__)}`."
     return f"{said}\n\n{pipe_table(lines)}"
 
 
@@ -441,8 +533,21 @@ def store(run: Path, target: Path) -> None:
     config = replace(config, **places, reader_settings=settings, heads=heads)
     replace(manifest, configuration=config).write(RunFolder(target).manifest)
     Rows.read(RunFolder(run).rows).in_single_precision().write(RunFolder(target).rows)
+    if sizes := planned_sizes(run):
+        write_json(target / PLANNED_FILE, sizes)
     if avatars := read_extremes([run]):
         write_json(target / FOLDER / RECORD_FILE, {"avatars": avatars})
+
+
+def planned_sizes(run: Path) -> dict[str, dict[str, object]]:
+    """Sizes that the training data of the first subject require, by method and setting."""
+    sizes = {}
+    for cell in sorted(run.glob("*/*/seed-0")):
+        file = RunFolder(run).cell(cell.parts[-3], cell.parts[-2], 0).avatar / "training.json"
+        decisions = read_json(file).get("capacity", {}).get("decisions", []) if file.is_file() else []
+        if decisions:
+            sizes.setdefault(cell.parts[-2], {each["name"]: each["chosen"] for each in decisions})
+    return sizes
 
 
 def main(what: str, out: Path, root: Path) -> None:
@@ -453,7 +558,7 @@ def main(what: str, out: Path, root: Path) -> None:
             store(run, stored.gallery / place / run.relative_to(out))
     stored.write()
     if what == "curves":
-        readme_pictures.draw_curves(stored.curve(*CURVED), root / "docs" / "pictures")
+        readme_pictures.draw_curves(stored.curve(), root / "docs" / "pictures")
     if what == "suite":
         readme_pictures.draw_subjects(out, stored.gallery / "subjects.jpg")
 

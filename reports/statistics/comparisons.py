@@ -234,7 +234,7 @@ class PairedComparison:
         if self.p_holm > self.level:
             return "no significant difference"
         if self.minus:
-            return "the differences differ"
+            return "depends on the task"
         return f"{self.first if (self.difference > 0) == self.higher_is_better else self.second} is better"
 
 

@@ -18,7 +18,7 @@ from ...bench.rows import ALL, FULL
 from ..aggregate import means_by_seed, whole_images
 from ..runs import FrameSelection, RunSet, synthetic_settings
 from ..statistics.comparisons import LEVEL as TEST_LEVEL
-from ..statistics.comparisons import PairedComparison, as_one_family, compare, detectable
+from ..statistics.comparisons import PairedComparison, as_one_family, compare, detectable, subjects_needed
 from ..table_report import Columns, table_of
 from ..tables import COMPARISON, Table
 from ..writers import pipe_table, to_markdown
@@ -99,6 +99,9 @@ def planned_subjects(runs: RunSet) -> int:
 
 def power_table(subjects: int) -> str:
     """Smallest differences that the first step of Holm's procedure finds with a power of 80 %, as a Markdown table."""
+    needed = subjects_needed(TEST_LEVEL, len(PRIMARY))
+    if subjects < needed:
+        return f"The tests of the endpoints find no difference with fewer than {needed} subjects."
     effect = detectable(subjects, TEST_LEVEL / len(PRIMARY))
     lines = [["endpoint", "metric", "assumed SD", f"difference found with {subjects} subjects"], ["---"] * 4]
     for each in PRIMARY:
@@ -250,8 +253,8 @@ def differences(
 COMPARED = "psnr"
 
 
-def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
-    """A table of standard deviations as Markdown, a row for each method and task and for the difference of ``pair``; "" with one seed.
+def variance_table(runs: RunSet, pair: tuple[str, str], *, of_methods: bool = True) -> str:
+    """Standard deviations as Markdown, by task: of the difference of ``pair`` and of each method; "" with one seed.
 
     Between subjects: of the means over seeds. Within subjects: of seeds about the mean of their subject, pooled over subjects
     (the square root of the mean variance). Subjects without all seeds are left out.
@@ -281,6 +284,8 @@ def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
                 for seed in first.keys() & second.keys()
             }
         for name, by_seed in values.items():
+            if name in runs.ranked and not of_methods:
+                continue
             if parts := components(by_seed):
                 subjects, mean, between, within = parts
                 place = [name, TASK_TITLES.get(task, task), str(subjects), str(len(by_seed))]
@@ -291,7 +296,7 @@ def variance_section(runs: RunSet, pair: tuple[str, str]) -> str:
         "Differences are between trainings with the same seed."
     )
     text = " ".join(filter(None, [how, runs.part]))
-    return f"## Variance between and within subjects\n\n{pipe_table(lines)}\n\n{text}"
+    return f"{pipe_table(lines)}\n\n{text}"
 
 
 def components(by_seed: Mapping[int, Mapping[str, float]]) -> tuple[int, float, float, float] | None:
@@ -346,7 +351,8 @@ def suite_report(folder: Path, method: str, read: Callable[[Sequence[Path]], Run
         names, base = [run.name for run in seeds], next(iter(runs))
         both = read([*(run for run in folders[base] if run.name in names), *seeds])
         part = FrameSelection(FACE if FACE in both.rows.regions else FULL)
-        text += f"\n{variance_section(both.only([*both.ranked]).of(part), PAIR)}\n"
+        table = variance_table(both.only([*both.ranked]).of(part), PAIR)
+        text += f"\n## Variance between and within subjects\n\n{table}\n"
     return text
 
 
