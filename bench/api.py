@@ -13,10 +13,10 @@ import pandas as pd
 from .condition import PLAIN
 from .contracts import Avatar, ByteArray, Clip, FrameKey, TaskName
 from .engine import run as runner
-from .engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
+from .engine.adaptation import AdaptedClip, MethodNeeds, adapt
 from .engine.captures import capture_configuration, open_clips, reader_of
 from .engine.cell import train as train_cell
-from .engine.config import ResolvedMethod, build_run_config, default_names, resolve_methods
+from .engine.config import build_run_config, default_names, resolve_methods
 from .engine.plan import Job, check_settings
 from .engine.scoring import ScoredFrames, check_regions, score_frames
 from .engine.store import RunFolder
@@ -126,7 +126,7 @@ def train(
     check_output_folder(folder.root)
     check_settings([(resolved, PLAIN)])
     with locked(folder.root):
-        form = _adapted(clip, resolved, {}, folder.adapted / clip.subject)
+        form = adapt(clip, MethodNeeds.of(resolved.spec), {}, folder.adapted / clip.subject)
         cell = folder.cell(clip.subject, resolved.spec.name, seed)
         job = Job(clip, resolved, seed, device, cell, {}, form)
         job.check()
@@ -240,17 +240,8 @@ def _stored(folder: Path, clip: Clip, device: str, scratch: Path) -> tuple[Adapt
     """A stored avatar, and the clip adapted to its method."""
     stored = open_avatar(folder)
     stored.check_subject(clip)
-    form = _adapted(clip, stored.method, stored.heads, scratch) or AdaptedClip(clip)
+    form = adapt(clip, MethodNeeds.of(stored.method.spec), stored.heads, scratch)
     return form, stored.load(device)
-
-
-def _adapted(
-    clip: Clip, method: ResolvedMethod, heads: Mapping[str, str], folder: Path
-) -> AdaptedClip | None:
-    """The clip adapted to a method, with results of slow steps in a folder; None if no adaptation is needed."""
-    needs = MethodNeeds.of(method.spec)
-    step = plan(clip, needs, heads)
-    return None if step is None else apply(step, needs, folder, f"adapting {clip.subject}")
 
 
 def _drawn(avatar: Any, form: AdaptedClip, protocol: Protocol, key: FrameKey) -> ByteArray:

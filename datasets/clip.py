@@ -248,6 +248,25 @@ class CaptureClip:
         record = StepRecord(step, parameters, self.fingerprint)
         return replace(self, steps=(*self.steps, record), **changes)
 
+    def to_render(
+        self,
+        step: str,
+        parameters: Mapping[str, Any],
+        keys: Sequence[FrameKey],
+        poses: Mapping[int, HeadPose],
+        cameras: Mapping[str, Camera],
+    ) -> CaptureClip:
+        """Copy with other frames, which are to be rendered and have no pixels; the step is recorded."""
+        return self.derive(
+            step,
+            parameters,
+            cameras=cameras,
+            poses={timestep: replace(pose, timestep=timestep) for timestep, pose in poses.items()},
+            splits={"train": (), "novel_view": (), "self_reenactment": tuple(keys)},
+            files=dict.fromkeys(keys, FrameFiles(None, None)),
+            excluded={},
+        )
+
     def derive_pixels(
         self, step: str, parameters: Mapping[str, Any], change: PixelStep, **changes: Any
     ) -> CaptureClip:

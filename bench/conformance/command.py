@@ -16,7 +16,7 @@ import tyro
 from ..comparison import DemoConfig
 from ..configuration import build_arguments, parse_assignments
 from ..contracts import Camera, Clip, FrameKey, HeadAsset, HeadPose, Progress, TaskName, no_progress
-from ..engine.adaptation import MethodNeeds, apply, plan
+from ..engine.adaptation import MethodNeeds, adapt
 from ..engine.captures import HARNESS, found_captures
 from ..engine.config import ResolvedMethod, RunConfig, resolve_method
 from ..errors import InputError
@@ -406,6 +406,4 @@ def _clip(settings: CheckPluginSettings, folder: Path, progress: Progress) -> Cl
 
 def _adapted(clip: Clip, method: ResolvedMethod, folder: Path) -> Clip:
     """The clip adapted to the method, as in a run."""
-    needs = MethodNeeds.of(method.spec)
-    planned = plan(clip, needs, {})
-    return clip if planned is None else apply(planned, needs, folder / "adapted", "adapting").clip
+    return adapt(clip, MethodNeeds.of(method.spec), {}, folder / "adapted").clip

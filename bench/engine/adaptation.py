@@ -83,6 +83,16 @@ def apply(adaptation: Adaptation, needs: MethodNeeds, folder: Path, label: str) 
     return adapted
 
 
+def adapt(
+    clip: Clip, needs: MethodNeeds, heads: Mapping[str, str], folder: Path, label: str = ""
+) -> AdaptedClip:
+    """`plan` and `apply` at once; a clip that meets the needs is not changed. ``label`` is that of the progress."""
+    adaptation = plan(clip, needs, heads)
+    if adaptation is None:
+        return AdaptedClip(clip)
+    return apply(adaptation, needs, folder, label or f"adapting {clip.subject}")
+
+
 def check(clip: Clip, needs: MethodNeeds) -> None:
     """Raise `InputError` for a head model or number of views that a method does not support."""
     where = f"clip {clip.subject}"

@@ -17,7 +17,7 @@ from ..io.files import check_name
 from ..progress import progress
 from ..registry import finds, get, readers, resolve
 from ..specs import LABEL, DatasetSpec, ResolutionRule, is_label
-from .adaptation import MethodNeeds, apply, plan
+from .adaptation import MethodNeeds, adapt
 from .config import RunConfig, RunOptions, resolve_change
 from .store import RunFolder
 
@@ -286,10 +286,7 @@ def changed(clip: Clip, change: Named, config: RunConfig) -> Clip:
 def _reduced(clip: Clip, config: RunConfig) -> Clip:
     """The clip at the size at which metrics are computed."""
     needs = MethodNeeds(resolution=ResolutionRule(divide=config.divide))
-    planned = plan(clip, needs, {})
-    if planned is None:
-        return clip
-    return apply(planned, needs, Path(config.out), f"reducing {clip.subject}").clip
+    return adapt(clip, needs, {}, Path(config.out), f"reducing {clip.subject}").clip
 
 
 def _checked(clip: Clip) -> Clip:

@@ -27,8 +27,7 @@ from ..contracts import (
     TrueFrame,
     no_progress,
 )
-from ..engine.adaptation import MethodNeeds, apply
-from ..engine.adaptation import plan as plan_adaptation
+from ..engine.adaptation import MethodNeeds, adapt
 from ..engine.config import RunOptions, with_methods
 from ..engine.plan import Job, trained
 from ..engine.run import run
@@ -403,7 +402,7 @@ def _truth(job: Job) -> tuple[TruthPictures | None, str]:
 
 
 def _surface(avatar: Avatar, given: GivenFrame, truth: TrueFrame) -> list[LimitCheck]:
-    """Errors of depth and normals, for an avatar that gives depth in images of the truth's size."""
+    """Errors of depth and normals, of an avatar that gives depth in images of the ground truth's shape."""
     height, width = truth.mask.shape
     camera = given.camera
     if camera.width * height != camera.height * width:
@@ -436,26 +435,18 @@ def given_frames(job: Job, plan: ExtremesPlan) -> list[GivenFrame]:
     """The frames of a plan, adapted to the job's method as its clip is: to another head model, image size, or one video."""
     if job.adapted is None:
         return [GivenFrame(plan.views[f.view].camera, f.pose, lambda image: image) for f in plan.frames]
-    from ...datasets.clip import FrameFiles, as_capture
+    from ...datasets.clip import as_capture
 
     poses = list({id(frame.pose): frame.pose for frame in plan.frames}.values())
     number = {id(pose): timestep for timestep, pose in enumerate(poses)}
     keys = [_key(job, plan, frame)._replace(timestep=number[id(frame.pose)]) for frame in plan.frames]
-    planned = as_capture(job.clip).derive(
-        TASK,
-        {"plan": plan.fingerprint},
-        cameras={view.camera.id: view.camera for view in plan.views},
-        poses={timestep: replace(pose, timestep=timestep) for timestep, pose in enumerate(poses)},
-        splits={"train": (), "novel_view": tuple(keys), "self_reenactment": ()},
-        files=dict.fromkeys(keys, FrameFiles(None, None)),
-        excluded={},
+    cameras = {view.camera.id: view.camera for view in plan.views}
+    planned = as_capture(job.clip).to_render(
+        TASK, {"plan": plan.fingerprint}, keys, dict(enumerate(poses)), cameras
     )
-    needs = MethodNeeds.of(job.method.spec)
     assert job.config is not None
-    adaptation = plan_adaptation(planned, needs, job.config.heads)
-    assert adaptation is not None  # as for the job's clip
     with TemporaryDirectory() as folder:
-        form = apply(adaptation, needs, Path(folder), f"adapting {TASK} of {job.clip.subject}")
+        form = adapt(planned, MethodNeeds.of(job.method.spec), job.config.heads, Path(folder))
     given = []
     for key in keys:
         own = form.key(key)

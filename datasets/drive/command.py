@@ -22,7 +22,7 @@ from ...bench.contracts import (
     Progress,
     no_progress,
 )
-from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
+from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, adapt
 from ...bench.engine.stored import HEAD_FILE, SUBJECT_FILE, StoredAvatar, open_avatar
 from ...bench.errors import InputError
 from ...bench.experiments.extremes import training_poses
@@ -34,7 +34,7 @@ from ...bench.io.lock import locked
 from ...bench.io.provenance import RENDER
 from ...bench.io.videos import SUFFIXES
 from ...bench.specs import CommandResult, command
-from ..clip import CaptureClip, FrameFiles, without_images
+from ..clip import CaptureClip, without_images
 from ..ga.writer import CANONICAL_JAW, CapturePlan, CaptureWriter, SequencePlan
 from ..head.arrays import JOINT_NAMES, HeadArrays, read_head
 from ..head.model import PosedSubject, pose_in_head_frame, resting
@@ -73,14 +73,7 @@ class AvatarScene:
         """The clip with other poses, all of them to be rendered; ``sequences`` names that of each timestep."""
         (camera,) = self.clip.cameras
         keys = [FrameKey(self.clip.subject, sequences[t], t, camera) for t in sorted(poses)]
-        numbered = {t: replace(pose, timestep=t) for t, pose in poses.items()}
-        return self.clip.derive(
-            "drive",
-            {"frames": len(keys)},
-            poses=numbered,
-            splits={"train": (), "novel_view": (), "self_reenactment": tuple(keys)},
-            files=dict.fromkeys(keys, FrameFiles(None, None)),
-        )
+        return self.clip.to_render("drive", {"frames": len(keys)}, keys, poses, self.clip.cameras)
 
 
 def make_scene(settings: DriveSettings, stored: StoredAvatar, progress: Progress) -> AvatarScene:
@@ -312,11 +305,9 @@ def drive_avatar(settings: DriveSettings, progress: Progress = no_progress) -> C
         if is_video:
             poses.pop(len(driven))
         clip = scene.driven(poses, sequences)
-        needs = MethodNeeds.of(stored.method.spec)
-        adaptation = plan(clip, needs, stored.heads)
-        avatar = stored.load(settings.device)
         kept = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        form = AdaptedClip(clip) if adaptation is None else apply(adaptation, needs, kept, "adapting")
+        form = adapt(clip, MethodNeeds.of(stored.method.spec), stored.heads, kept)
+        avatar = stored.load(settings.device)
         renderer = Renderer(avatar, clip, form, progress)
         written = out
         if is_video:

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ...bench.contracts import ByteArray, Camera, Clip, FloatArray, HeadPose, Progress, no_progress
-from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
+from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, adapt
 from ...bench.engine.captures import open_clips, reader_of
 from ...bench.engine.config import AvatarFolder, RunConfig
 from ...bench.engine.store import Cell
@@ -94,13 +94,9 @@ def render_avatar(settings: RenderSettings, progress: Progress = no_progress) ->
         browser_encoder()
     stored = open_avatar(Path(settings.avatar), settings.method)
     clip = _clip(settings)
-    needs = MethodNeeds.of(stored.method.spec)
-    adaptation = plan(clip, needs, stored.heads)
-    avatar = stored.load(settings.device)
     out = Path(settings.out)
-    form = AdaptedClip(clip)
-    if adaptation is not None:
-        form = apply(adaptation, needs, out / "adapted" / clip.subject, f"adapting {clip.subject}")
+    form = adapt(clip, MethodNeeds.of(stored.method.spec), stored.heads, out / "adapted" / clip.subject)
+    avatar = stored.load(settings.device)
     orbit = settings.frames == ORBIT
     shots = [*(_orbit(settings, form, out) if orbit else _frames(settings, clip, form, out))]
     background = clip.background.tolist()

@@ -14,7 +14,7 @@ import tyro
 
 from ...bench.condition import PLAIN
 from ...bench.contracts import Avatar, Camera, Clip, FloatArray, FrameKey, HeadPose
-from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
+from ...bench.engine.adaptation import AdaptedClip, MethodNeeds, adapt
 from ...bench.engine.captures import open_clips, open_run_clips, reader_of, run_configuration
 from ...bench.engine.config import ResolvedMethod, RunConfig, RunOptions, resolve_methods
 from ...bench.engine.plan import make_jobs
@@ -345,10 +345,7 @@ def _config(data: str, settings: ViewSettings, kept: Path) -> RunConfig:
 
 
 def _form(clip: Clip, needs: MethodNeeds, heads: Mapping[str, str], kept: Path) -> AdaptedClip:
-    adaptation = plan(clip, needs, heads)
-    if adaptation is None:
-        return AdaptedClip(clip)
-    return apply(adaptation, needs, kept / "adapted" / clip.subject, f"adapting {clip.subject}")
+    return adapt(clip, needs, heads, kept / "adapted" / clip.subject)
 
 
 def _source(settings: ViewSettings, config: RunConfig) -> list[Clip]:

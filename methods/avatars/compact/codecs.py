@@ -29,7 +29,7 @@ from ....bench.contracts import (
     SplatAvatar,
     no_progress,
 )
-from ....bench.engine.adaptation import AdaptedClip, MethodNeeds, apply, plan
+from ....bench.engine.adaptation import AdaptedClip, MethodNeeds, adapt
 from ....bench.engine.stored import avatar_digest, open_avatar, write_avatar_record
 from ....bench.errors import InputError
 from ....bench.io.arrays import read_npz
@@ -297,8 +297,7 @@ def compact_avatar(settings: CompactSettings, progress: Progress = no_progress) 
             if clip.subject != subject:
                 raise InputError(settings.compare, "subject", repr(subject), repr(clip.subject))
             needs, kept = MethodNeeds.of(stored.method.spec), Path(scratch) / "adapted"
-            step = plan(clip, needs, stored.heads)
-            form = AdaptedClip(clip) if step is None else apply(step, needs, kept, f"adapting {clip.subject}")
+            form = adapt(clip, needs, stored.heads, kept)
             comparison = Comparison(clip, form, exact, settings.frames, settings.scale)
         adapted = None if form is None else form.clip
         prepared = parts_of(exact, head, adapted)

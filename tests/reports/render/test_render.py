@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from headbench.bench.engine.adaptation import AdaptedClip
 from headbench.bench.engine.store import RunFolder
 from headbench.bench.errors import InputError, UnavailableError
 from headbench.bench.io.files import digest_file
@@ -77,7 +78,9 @@ def test_an_orbit_looks_at_the_head_from_all_sides(settings):
 
 def test_a_capture_is_refitted_to_the_head_model_of_the_avatar(settings, cell, monkeypatch):
     asked = []
-    monkeypatch.setattr(module, "plan", lambda clip, needs, heads: asked.append(heads))
+    monkeypatch.setattr(
+        module, "adapt", lambda clip, needs, heads, folder: asked.append(heads) or AdaptedClip(clip)
+    )
     render_avatar(settings)
     head = cell.avatar / "head_model.npz"
     head.touch()
